@@ -1,0 +1,304 @@
+"""Training the low-level controller with Soft Actor-Critic on the edges of a roadmap (paper, Algorithm 2).
+
+The networks, losses, replay buffer and running statistics are brax's; the loop is ours, because brax's own trainer can
+neither draw fresh goals at a reset nor be resumed. The controller sees proprioception and the vector to its goal, never
+a wall.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import State
+from brax.training import gradients, replay_buffers
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.sac import losses as sac_losses
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.types import Transition
+from flax import struct
+from jaxtyping import Array, Float
+
+from ct_envs import MazeEnv, Tasks, UserError
+from ct_envs.maze import Maze
+from ct_jax.prm import Roadmap
+from ct_jax.rollout import Action, Controller, rollout
+
+
+@dataclass(frozen=True)
+class SacConfig:
+    """Soft Actor-Critic (paper, sec. III-F, where it says; otherwise the usual values)."""
+
+    envs: int = 64  # environments stepped together
+    iterations: int = 500  # each: one step of all environments, then the updates
+    updates: int = 8  # gradient updates an iteration
+    warmup: int = 20  # first iterations, with random actions and no updates
+    batch: int = 256  # paper
+    learning_rate: float = 3e-4  # paper
+    hidden: tuple[int, ...] = (256, 256)  # paper, for point and ant
+    discount: float = 0.97
+    initial_temperature: float = 0.1
+    arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
+    target_rate: float = 0.005  # share of the new critic in the target critic at each update
+    replay: int = 200_000  # transitions kept
+    episode_steps: int = 60  # control steps to walk an edge
+    reset_velocity_mps: float = 2.0  # spread of the speed at an edge's start: a plan arrives there moving
+    held_out: float = 0.1  # share of the edges kept for the final test
+
+
+@struct.dataclass
+class SacState:
+    """Everything that training needs to go on."""
+
+    policy: Any
+    critic: Any
+    target_critic: Any
+    log_alpha: jax.Array
+    policy_optimizer: Any
+    critic_optimizer: Any
+    alpha_optimizer: Any
+    normalizer: running_statistics.RunningStatisticsState
+    replay: replay_buffers.ReplayBufferState
+    env: State
+    key: jax.Array
+    iteration: jax.Array
+
+
+def _observe(state: State) -> jax.Array:
+    return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
+
+
+def _networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
+    return sac_networks.make_sac_networks(
+        observation_size,
+        action_size,
+        preprocess_observations_fn=running_statistics.normalize,
+        hidden_layer_sizes=hidden,
+    )
+
+
+@struct.dataclass
+class SacController:
+    """The trained pi_c, deterministic."""
+
+    normalizer: Any
+    policy: Any
+    action_size: int = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
+        networks = _networks(proprio.shape[-1] + 2, self.action_size, self.hidden)
+        logits = networks.policy_network.apply(self.normalizer, self.policy, jnp.concatenate([proprio, goal], -1))
+        return networks.parametric_action_distribution.mode(logits)
+
+
+def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Tasks]:
+    """Edges, each in both directions, as training and held-out tasks.
+
+    Raises:
+        UserError: the roadmap has too few edges to hold any out.
+    """
+    edges = np.concatenate([roadmap.edges, roadmap.edges[:, ::-1]])
+    edges = np.random.default_rng(seed).permutation(edges)
+    n = int(held_out * len(edges))
+    if n < 1:
+        raise UserError(f"the roadmap has only {len(roadmap.edges)} edges; sample more points or connect farther")
+    return _tasks(roadmap, edges[n:]), _tasks(roadmap, edges[:n])
+
+
+def _tasks(roadmap: Roadmap, edges: np.ndarray) -> Tasks:
+    start, goal = (jnp.asarray(roadmap.points[edges[:, i]]) for i in (0, 1))
+    return Tasks(start, goal, jnp.asarray(len(edges), jnp.int32))
+
+
+class Sac:
+    """The learner: ``create`` and ``train`` on states, both pure."""
+
+    def __init__(self, env: MazeEnv, config: SacConfig):
+        """
+        Args:
+            env: with auto-reset and without maps; its robot says which reward is used.
+        """
+        self.env, self.config = env, config
+        self.networks = _networks(env.proprio_size + 2, env.action_size, config.hidden)
+        self._optimizer = optax.adam(config.learning_rate)
+        alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
+            self.networks, reward_scaling=1.0, discounting=config.discount, action_size=env.action_size
+        )
+        update = functools.partial(gradients.gradient_update_fn, pmap_axis_name=None)
+        self._alpha_update = update(alpha_loss, self._optimizer)
+        self._critic_update = update(critic_loss, self._optimizer)
+        self._actor_update = update(actor_loss, self._optimizer)
+        size = env.proprio_size + 2
+        example = Transition(
+            observation=jnp.zeros(size),
+            action=jnp.zeros(env.action_size),
+            reward=jnp.zeros(()),
+            discount=jnp.zeros(()),
+            next_observation=jnp.zeros(size),
+            extras={"state_extras": {"truncation": jnp.zeros(())}},
+        )
+        self._buffer = replay_buffers.UniformSamplingQueue(config.replay, example, config.batch)
+        self.train = jax.jit(self._train, static_argnames="iterations")
+
+    def create(self, key: jax.Array, maze: Maze, tasks: Tasks) -> SacState:
+        """The state before training, in one maze with the given edges."""
+        policy_key, critic_key, buffer_key, env_key, key = jax.random.split(key, 5)
+        policy = self.networks.policy_network.init(policy_key)
+        critic = self.networks.q_network.init(critic_key)
+        log_alpha = jnp.log(jnp.asarray(self.config.initial_temperature))
+        resets = jax.vmap(self.env.reset, in_axes=(0, None, None))
+        return SacState(
+            policy=policy,
+            critic=critic,
+            target_critic=critic,
+            log_alpha=log_alpha,
+            policy_optimizer=self._optimizer.init(policy),
+            critic_optimizer=self._optimizer.init(critic),
+            alpha_optimizer=self._optimizer.init(log_alpha),
+            normalizer=running_statistics.init_state(specs.Array((self.env.proprio_size + 2,), jnp.dtype("float32"))),
+            replay=self._buffer.init(buffer_key),
+            env=resets(jax.random.split(env_key, self.config.envs), maze, tasks),
+            key=key,
+            iteration=jnp.zeros((), jnp.int32),
+        )
+
+    def _train(self, state: SacState, iterations: int) -> tuple[SacState, dict[str, jax.Array]]:
+        """Run some iterations (static); returns means over them."""
+
+        def iterate(state: SacState, _) -> tuple[SacState, dict[str, jax.Array]]:
+            state, collected = self._collect(state)
+            state, losses = jax.lax.cond(
+                state.iteration >= self.config.warmup,
+                self._updates,
+                lambda s: (s, jax.tree.map(jnp.zeros_like, jax.eval_shape(self._updates, s)[1])),
+                state,
+            )
+            return state.replace(iteration=state.iteration + 1), collected | losses
+
+        state, metrics = jax.lax.scan(iterate, state, length=iterations)
+        ends = jnp.maximum(metrics["episodes"].sum(), 1.0)
+        means = jax.tree.map(jnp.mean, metrics)
+        return state, means | {"success": metrics["successes"].sum() / ends}
+
+    def _collect(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
+        key, act_key, random_key = jax.random.split(state.key, 3)
+        observation = _observe(state.env)
+        logits = self.networks.policy_network.apply(state.normalizer, state.policy, observation)
+        action = self.networks.parametric_action_distribution.sample(logits, act_key)
+        random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(state.iteration < self.config.warmup, random, action)
+        after = jax.vmap(self.env.step)(state.env, action)
+        reward = self._reward(state.env, after)
+        over = after.done
+        truncation = after.info["truncation"]
+        transition = Transition(
+            observation=observation,
+            action=action,
+            reward=reward,
+            discount=1.0 - over,
+            next_observation=_observe(after),
+            extras={"state_extras": {"truncation": truncation}},
+        )
+        state = state.replace(
+            key=key,
+            env=after,
+            normalizer=running_statistics.update(state.normalizer, observation),
+            replay=self._buffer.insert_internal(state.replay, transition),
+        )
+        return state, {"reward": reward.mean(), "episodes": over.sum(), "successes": (over * after.info["success"]).sum()}
+
+    def _reward(self, before: State, after: State) -> jax.Array:
+        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; and the bonus."""
+        robot = self.env.robot
+        distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
+        dense = {
+            "velocity": (distance + after.reward) / robot.control_dt_s,
+            "distance": after.reward,
+        }[robot.controller_reward]
+        return dense + self.config.arrival_bonus * after.done * after.info["success"]
+
+    def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
+        state, losses = jax.lax.scan(lambda s, _: self._update(s), state, length=self.config.updates)
+        return state, jax.tree.map(jnp.mean, losses)
+
+    def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
+        key, alpha_key, critic_key, actor_key = jax.random.split(state.key, 4)
+        replay, batch = self._buffer.sample_internal(state.replay)
+        alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
+            state.log_alpha, state.policy, state.normalizer, batch, alpha_key, optimizer_state=state.alpha_optimizer
+        )
+        alpha = jnp.exp(state.log_alpha)
+        critic_loss, critic, critic_optimizer = self._critic_update(
+            state.critic, state.policy, state.normalizer, state.target_critic, alpha, batch, critic_key,
+            optimizer_state=state.critic_optimizer,
+        )  # fmt: skip
+        actor_loss, policy, policy_optimizer = self._actor_update(
+            state.policy, state.normalizer, state.critic, alpha, batch, actor_key,
+            optimizer_state=state.policy_optimizer,
+        )  # fmt: skip
+        target = optax.incremental_update(critic, state.target_critic, self.config.target_rate)
+        state = state.replace(
+            policy=policy, critic=critic, target_critic=target, log_alpha=log_alpha,
+            policy_optimizer=policy_optimizer, critic_optimizer=critic_optimizer, alpha_optimizer=alpha_optimizer,
+            replay=replay, key=key,
+        )  # fmt: skip
+        losses = {"alpha_loss": alpha_loss, "critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
+        return state, losses
+
+
+@struct.dataclass
+class Steered:
+    """The controller heading straight for the environment's goal: how edges are tested."""
+
+    controller: Controller
+
+    def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
+        action = self.controller(state.obs["proprio"], state.obs["goal"])  # pyright: ignore
+        return Action(action, action), memory
+
+
+def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
+    """Share of the given edges that the controller walks in time, from rest. ``env`` must not reset by itself."""
+    n = tasks.start.shape[0]
+    one_each = Tasks(tasks.start[:, None], tasks.goal[:, None], jnp.ones(n, jnp.int32))
+    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, 0)))(jax.random.split(key, n), maze, one_each)
+    state, _, _ = rollout(env, Steered(act), state, (), key, env.horizon)
+    return float(state.info["success"].mean())
+
+
+def train_controller(
+    key: jax.Array,
+    env_factory: Callable[..., MazeEnv],
+    maze: Maze,
+    roadmap: Roadmap,
+    config: SacConfig,
+    *,
+    on_progress: Callable[[int, dict[str, float]], None] = lambda iteration, metrics: None,
+    chunk: int = 50,
+) -> tuple[SacController, float]:
+    """Algorithm 2: learn pi_c on the roadmap's edges.
+
+    Args:
+        env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
+        on_progress: told (iterations done, metrics) after every ``chunk`` iterations.
+
+    Returns:
+        The controller, and its success on held-out edges.
+    """
+    train_key, test_key, split_key = jax.random.split(key, 3)
+    seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
+    train_tasks, test_tasks = split_edges(roadmap, config.held_out, seed)
+    env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
+    sac = Sac(env, config)
+    state = sac.create(train_key, maze, train_tasks)
+    for done in range(chunk, config.iterations + 1, chunk):
+        state, metrics = sac.train(state, chunk)
+        on_progress(done, {name: float(value) for name, value in metrics.items()})
+    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden)
+    test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
+    return act, edge_success(test_env, act, maze, test_tasks, test_key)

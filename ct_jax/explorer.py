@@ -1,0 +1,87 @@
+"""The explorer: the reference a user would otherwise pick, with the transformer's own information.
+
+It remembers every maze cell of which its local maps showed some point, takes all others for free, and at every step
+heads for the cell in believed sight that makes the shortest believed way to the goal. It knows odometry and the size
+and alignment of the maze's cells, which the transformer must do without.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from ct_envs.maze import Maze, cell_of, is_wall, segment_free, segment_reach
+from ct_envs.occupancy import MAP_CELLS
+
+
+@struct.dataclass
+class Seen:
+    """Which cells of the maze have been seen."""
+
+    cells: Bool[Array, "N H W"]
+
+
+@dataclass(frozen=True)
+class ExplorerGuide:
+    """Optimistic replanning on the cells seen so far, for N environments at once."""
+
+    radius_m: float
+    map_cell_m: float
+    cell_m: float
+    look_m: float = 10.0  # farthest waypoint [m]; the controller was trained on edges of this length
+
+    def init(self, maze: Maze) -> Seen:
+        """Nothing seen yet. ``maze`` has a leading axis N, here and below."""
+        return Seen(jnp.zeros(maze.walls.shape, bool))
+
+    def waypoint(self, seen: Seen, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]):
+        """Targets [N, 2] (m), and what has been seen by now."""
+        seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
+        believed = maze.replace(walls=maze.walls & seen.cells)
+        to_go = _distances(believed, jax.vmap(cell_of)(maze, goal))
+        return jax.vmap(self._choose)(believed, to_go, position, goal), seen
+
+    def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
+        """Cells of which the local map at ``position`` holds at least one point."""
+        offset = (jnp.arange(MAP_CELLS) - (MAP_CELLS - 1) / 2) * self.map_cell_m
+        column, row = jnp.floor((position[:, None] + offset) / maze.cell_m).astype(jnp.int32)
+        height, width = maze.shape
+        rows = jnp.any(row[:, None] == jnp.arange(height), 0)
+        columns = jnp.any(column[:, None] == jnp.arange(width), 0)
+        return rows[:, None] & columns[None, :]
+
+    def _choose(self, believed: Maze, to_go: jax.Array, position: jax.Array, goal: jax.Array) -> jax.Array:
+        side = jnp.arange(-2, 3)
+        offsets = jnp.stack(jnp.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+        cells = cell_of(believed, position) + offsets
+        points = jnp.concatenate([goal[None], (cells[:, ::-1] + 0.5) * believed.cell_m])
+        height, width = believed.shape
+        on_grid = to_go[jnp.clip(cells[:, 0], 0, height - 1), jnp.clip(cells[:, 1], 0, width - 1)]
+        rest = jnp.concatenate([jnp.zeros(1), jnp.where(is_wall(believed, cells), jnp.inf, on_grid)])
+        away = jnp.linalg.norm(points - position, axis=-1)
+        reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
+        free = jax.vmap(lambda p: segment_free(believed, position, p, radius=self.radius_m, reach=reach))(points)
+        # The robot may touch a wall and so see nothing at full width: then its own cell's centre will do.
+        usable = (free & (away <= self.look_m)) | (jnp.arange(len(points)) == 1 + len(offsets) // 2)
+        return points[jnp.argmin(jnp.where(usable, away + rest, jnp.inf))]
+
+
+def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
+    """Way [m] to the goal's cell over 4-connected cells that are not wall, for N mazes at once (value iteration)."""
+    height, width = maze.shape
+    at_goal = (jnp.arange(height)[:, None] == goal[:, :1, None]) & (jnp.arange(width) == goal[:, 1:, None])
+    cost = jnp.where(maze.walls, jnp.inf, maze.cell_m[:, None, None])
+    start = jnp.where(at_goal, 0.0, jnp.inf)
+
+    def sweep(carry):
+        d, _ = carry
+        p = jnp.pad(d, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
+        near = jnp.minimum(
+            jnp.minimum(p[:, :-2, 1:-1], p[:, 2:, 1:-1]), jnp.minimum(p[:, 1:-1, :-2], p[:, 1:-1, 2:])
+        )
+        new = jnp.minimum(d, near + cost)
+        return new, jnp.any(new < d)
+
+    return jax.lax.while_loop(lambda carry: carry[1], sweep, (start, jnp.array(True)))[0]

@@ -1,0 +1,262 @@
+"""Probabilistic roadmaps: the planner that knows the maze (paper, sec. III-A).
+
+A ``Roadmap`` is a ``networkx`` graph with its points as an array and, for use under jit, an all-pairs table of next
+hops, so that "where do I go next" is a lookup with thousands of environments on different mazes at once.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import networkx as nx
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from ct_envs.errors import UserError
+from ct_envs.maze import Maze, clearance, segment_free, segment_reach, unpadded
+
+NO_HOP = -1  # entry of the next-hop table where there is no path
+
+
+@dataclass(frozen=True)
+class PrmConfig:
+    """How roadmaps are sampled (paper, sec. III-F)."""
+
+    samples: int = 200  # n
+    connect_m: float = 10.0  # d: longest edge [m]
+    margin_m: float = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps none
+
+
+@struct.dataclass
+class PlanTable:
+    """A roadmap as arrays, for use under jit. May have leading batch axes."""
+
+    points: Float[Array, "*b n 2"]  # [m]
+    next_hop: Int[Array, "*b n n"]  # int16: next_hop[i, j] is the point after i on a shortest path to j
+    distance: Float[Array, "*b n n"]  # length of that path [m]; inf where there is none
+
+
+@dataclass(frozen=True)
+class Path:
+    """A shortest path: points [k, 2] from start to goal [m] and its length [m]."""
+
+    points: np.ndarray
+    length_m: float
+
+
+@dataclass(frozen=True)
+class NoPath:
+    """The answer for a pair that the roadmap does not connect."""
+
+    start: tuple[float, float]
+    goal: tuple[float, float]
+    reason: str
+
+    def __str__(self) -> str:
+        start, goal = (f"({x:.2f}, {y:.2f})" for x, y in (self.start, self.goal))
+        return f"no path from {start} to {goal}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Roadmap:
+    """A graph over collision-free points. Nodes are 0 ... n-1; edges carry their length as ``weight`` [m]."""
+
+    graph: nx.Graph
+    points: np.ndarray  # float32 [n, 2], [m]
+    edges: np.ndarray  # int32 [m, 2], each once, first < second
+    maze: Maze
+    radius_m: float  # kept clear by every edge
+    config: PrmConfig
+
+    @functools.cached_property
+    def table(self) -> PlanTable:
+        """Next hops and distances between all pairs of points."""
+        n = len(self.points)
+        length = np.linalg.norm(self.points[self.edges[:, 0]] - self.points[self.edges[:, 1]], axis=1)
+        both = np.concatenate([self.edges, self.edges[:, ::-1]])
+        weights = csr_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(n, n))
+        distance, predecessor = dijkstra(weights, directed=False, return_predecessors=True)
+        # The point before i on a path from j is, the graph being undirected, the one after i on the way to j.
+        next_hop = np.where(predecessor.T < 0, NO_HOP, predecessor.T).astype(np.int16)
+        np.fill_diagonal(next_hop, np.arange(n))
+        return PlanTable(jnp.asarray(self.points), jnp.asarray(next_hop), jnp.asarray(distance, jnp.float32))
+
+    def plan(self, start: np.ndarray, goal: np.ndarray) -> Path | NoPath:
+        """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
+        ends = np.asarray([start, goal], np.float32)
+        for name, point in zip(("start", "goal"), ends, strict=True):
+            if float(_clearances(self.maze, jnp.asarray(point[None]))[0]) < self.radius_m:
+                return NoPath(tuple(ends[0]), tuple(ends[1]), f"the {name} is inside a wall or touches one")
+        grown = extend(self, ends)
+        n = len(self.points)
+        try:
+            nodes = nx.shortest_path(grown.graph, n, n + 1, weight="weight")
+        except nx.NetworkXNoPath:
+            return NoPath(tuple(ends[0]), tuple(ends[1]), "no chain of free roadmap edges joins them")
+        points = grown.points[nodes]
+        return Path(points, float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
+
+
+def build_roadmap(key: jax.Array, maze: Maze, *, radius_m: float, config: PrmConfig | None = None) -> Roadmap:
+    """Sample a roadmap: points uniform over the collision-free area, edges wherever the swept robot stays free.
+
+    Args:
+        key: the only source of randomness.
+        radius_m: of the robot [m]; ``config.margin_m`` is added to it.
+
+    Raises:
+        UserError: the maze is too narrow for the robot.
+    """
+    config = config or PrmConfig()
+    radius = radius_m + config.margin_m
+    seed = np.asarray(jax.random.key_data(key)).astype(np.uint32)
+    rng = np.random.default_rng(seed)
+    return connect(_sample_points(rng, maze, radius, config.samples), maze, radius, config)
+
+
+def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
+    """The roadmap with further points [k, 2] (m), appended in order and connected as samples are."""
+    everything = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
+    return connect(everything, roadmap.maze, roadmap.radius_m, roadmap.config)
+
+
+def connect(points: np.ndarray, maze: Maze, radius: float, config: PrmConfig) -> Roadmap:
+    """Join all pairs of points within the connect distance whose straight way is free, in one batched check."""
+    pairs = cKDTree(points).query_pairs(config.connect_m, output_type="ndarray").astype(np.int32)
+    reach = segment_reach(config.connect_m, radius, float(maze.cell_m))
+    padded = np.zeros((_bucket(len(pairs)), 2), np.int32)
+    padded[: len(pairs)] = pairs
+    free = np.asarray(_segments_free(maze, jnp.asarray(points[padded]), jnp.float32(radius), reach))[: len(pairs)]
+    edges = pairs[free]
+    graph = nx.Graph()
+    graph.add_nodes_from(range(len(points)))
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    graph.add_weighted_edges_from(
+        zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True)
+    )
+    return Roadmap(graph, points, edges, maze, radius, config)
+
+
+def _bucket(n: int) -> int:
+    """Sizes of compiled edge checks: powers of two, so that few programs serve all roadmaps."""
+    return max(1024, 1 << (n - 1).bit_length())
+
+
+@functools.partial(jax.jit, static_argnames="reach")
+def _segments_free(maze: Maze, ends: Float[Array, "m 2 2"], radius: jax.Array, reach: int) -> jax.Array:
+    return jax.vmap(lambda e: segment_free(maze, e[0], e[1], radius=radius, reach=reach))(ends)
+
+
+@jax.jit
+def _clearances(maze: Maze, points: Float[Array, "m 2"]) -> jax.Array:
+    return jax.vmap(clearance, (None, 0))(maze, points)
+
+
+def _sample_points(rng: np.random.Generator, maze: Maze, radius: float, n: int) -> np.ndarray:
+    """n points uniform over the area with clearance ``radius``, by rejection."""
+    cell = float(maze.cell_m)
+    free = np.argwhere(~np.asarray(maze.walls))[:, ::-1]
+    kept: list[np.ndarray] = []
+    count = 0
+    for _ in range(50):
+        draw = (free[rng.integers(len(free), size=4 * n)] + rng.random((4 * n, 2))) * cell
+        good = draw[np.asarray(_clearances(maze, jnp.asarray(draw, jnp.float32))) >= radius]
+        kept.append(good.astype(np.float32))
+        count += len(good)
+        if count >= n:
+            return np.concatenate(kept)[:n]
+    rows, columns = unpadded(maze).shape
+    raise UserError(
+        f"maze of {rows} x {columns} cells of {cell} m has no room for a robot of radius {radius} m; use larger cells"
+    )
+
+
+def stack_tables(roadmaps: list[Roadmap]) -> PlanTable:
+    """Tables of roadmaps of equal size, stacked along a new leading axis."""
+    tables = [roadmap.table for roadmap in roadmaps]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+
+
+@struct.dataclass
+class Following:
+    """Where N environments are on their plans: their roadmaps, seen from their goals."""
+
+    points: Float[Array, "N n 2"]  # [m]
+    next_hop: Int[Array, "N n"]  # towards the goal
+    to_go: Float[Array, "N n"]  # way to the goal's point [m]
+    waypoint: Int[Array, "N"]
+    goal_node: Int[Array, "N"]
+
+
+@dataclass(frozen=True)
+class RoadmapGuide:
+    """Gives each environment the next waypoint of its plan (paper, sec. III-A).
+
+    Plans follow the roadmap's shortest path, point after point. With ``shortcut`` the waypoint is instead, at every
+    step, the point in sight that makes the shortest way to the goal: smoother, and it recovers from any disturbance.
+    """
+
+    radius_m: float  # kept clear when a new waypoint is chosen [m]
+    look_m: float = 10.0  # farthest waypoint that is chosen anew [m]
+    cell_m: float = 4.0
+    waypoint_tolerance_m: float = 0.5
+    shortcut: bool = False
+
+    def init(
+        self, tables: PlanTable, which: Int[Array, "N"], maze: Maze, position: jax.Array, goal: jax.Array
+    ) -> Following:
+        """Connect starts and goals [N, 2] (m) to their roadmaps ``which``; ``maze`` has a leading axis N."""
+        points = tables.points[which]
+        goal_node = jax.vmap(self._nearest_in_sight)(points, maze, goal)
+        plan = Following(
+            points=points,
+            next_hop=tables.next_hop[which, :, goal_node].astype(jnp.int32),
+            to_go=tables.distance[which, :, goal_node],
+            waypoint=goal_node,
+            goal_node=goal_node,
+        )
+        return plan.replace(waypoint=self._choose(plan, maze, position))
+
+    def waypoint(
+        self, plan: Following, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]
+    ) -> tuple[Float[Array, "N 2"], Following]:
+        """Targets [N, 2] (m), and the plans with reached waypoints passed and lost ones chosen anew."""
+        if self.shortcut:
+            plan = plan.replace(waypoint=self._choose(plan, maze, position))
+        row = jnp.arange(len(plan.waypoint))
+        at = plan.points[row, plan.waypoint]
+        reached = jnp.linalg.norm(at - position, axis=-1) < self.waypoint_tolerance_m
+        hop = plan.next_hop[row, plan.waypoint]
+        waypoint = jnp.where(reached & (hop != NO_HOP), hop, plan.waypoint)
+        # A robot that grazes a wall still sees its waypoint: hence less than its radius.
+        sees = jax.vmap(functools.partial(self._sees, radius=0.8 * self.radius_m))
+        lost = ~sees(maze, position, plan.points[row, waypoint][:, None])[:, 0]
+        waypoint = jax.lax.cond(
+            jnp.any(lost),
+            lambda: jnp.where(lost, self._choose(plan, maze, position), waypoint),
+            lambda: waypoint,
+        )
+        plan = plan.replace(waypoint=waypoint)
+        last = (waypoint == plan.goal_node) & sees(maze, position, goal[:, None])[:, 0]
+        return jnp.where(last[:, None], goal, plan.points[row, waypoint]), plan
+
+    def _choose(self, plan: Following, maze: Maze, position: jax.Array) -> Int[Array, "N"]:
+        """The point in sight that makes the shortest way to the goal; the nearest point where none is in sight."""
+        away = jnp.linalg.norm(plan.points - position[:, None], axis=-1)
+        free = jax.vmap(functools.partial(self._sees, radius=self.radius_m))(maze, position, plan.points)
+        way = jnp.where(free & (away <= self.look_m), away + plan.to_go, jnp.inf)
+        return jnp.where(jnp.isfinite(way).any(-1), jnp.argmin(way, -1), jnp.argmin(away, -1))
+
+    def _nearest_in_sight(self, points: jax.Array, maze: Maze, goal: jax.Array) -> jax.Array:
+        away = jnp.linalg.norm(points - goal, axis=-1)
+        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, radius=self.radius_m), 0.0, 1e6))
+
+    def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "n 2"], *, radius: float) -> jax.Array:
+        reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
+        free = jax.vmap(lambda p: segment_free(maze, position, p, radius=radius, reach=reach))(points)
+        return free & (jnp.linalg.norm(points - position, axis=-1) <= 1.5 * self.look_m)

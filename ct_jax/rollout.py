@@ -1,0 +1,115 @@
+"""The one scan that steps environments under a policy."""
+
+import functools
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from flax import struct
+from jaxtyping import Array, Float
+
+from ct_envs import MazeEnv
+from ct_envs.maze import Maze
+
+
+class Action(NamedTuple):
+    """What a policy meant to do, and what is done: they differ where a disturbance is added on purpose."""
+
+    meant: Float[Array, "N A"]
+    done: Float[Array, "N A"]
+
+
+class Policy(Protocol):
+    """Acts in N environments at once. A pytree; its memory of the episode is another."""
+
+    def act(self, memory: Any, state: State, key: jax.Array) -> tuple[Action, Any]:
+        """Actions for N states, and the memory after them."""
+        ...
+
+
+@struct.dataclass
+class Steps:
+    """What happened, time first: [T, N, ...]. State before the action, outcome after it."""
+
+    position: Float[Array, "T N 2"]
+    proprio: Float[Array, "T N P"]
+    action: Float[Array, "T N A"]  # as meant
+    reward: Float[Array, "T N"]
+    alive: Float[Array, "T N"]  # 1 where the episode was still running before the action
+    success: Float[Array, "T N"]
+    collision: Float[Array, "T N"]
+
+
+@functools.partial(jax.jit, static_argnames=("env", "length"))
+def rollout(
+    env: MazeEnv, policy: Policy, state: State, memory: Any, key: jax.Array, length: int
+) -> tuple[State, Any, Steps]:
+    """Step N environments ``length`` times (static). Environments without auto-reset stay where they finished."""
+    step = jax.vmap(env.step)
+
+    def once(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Steps]:
+        state, memory = carry
+        action, memory = policy.act(memory, state, key)
+        after = step(state, action.done)
+        record = Steps(
+            position=state.info["position"],
+            proprio=state.obs["proprio"],  # pyright: ignore[reportArgumentType]
+            action=action.meant,
+            reward=after.reward,
+            alive=1.0 - state.done,
+            success=after.info["success"],
+            collision=after.info["collision"],
+        )
+        return (after, memory), record
+
+    (state, memory), steps = jax.lax.scan(once, (state, memory), jax.random.split(key, length))
+    return state, memory, steps
+
+
+class Controller(Protocol):
+    """pi_c. A pytree, so that its parameters are arguments of compiled programs."""
+
+    def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
+        """Actions from proprioception and the vector to a goal close by [m]."""
+        ...
+
+
+class Guide(Protocol):
+    """A planner, asked at every step for the next waypoint."""
+
+    def waypoint(
+        self, memory: Any, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]
+    ) -> tuple[Float[Array, "N 2"], Any]:
+        """Targets [m], and the guide's memory after them."""
+        ...
+
+
+@struct.dataclass
+class Guided:
+    """The controller led by a planner (paper, sec. III-A). Its memory is (the guide's, the disturbance [N, A])."""
+
+    controller: Controller
+    guide: Guide = struct.field(pytree_node=False)
+    noise: float = struct.field(pytree_node=False, default=0.0)  # size of the disturbance of the actions
+    hold: float = struct.field(pytree_node=False, default=0.9)  # chance that it stays as it is for another step
+
+    def init(self, state: State, guide_memory: Any) -> tuple[Any, jax.Array]:
+        n = state.done.shape[0]
+        return guide_memory, jnp.zeros((n, self.intend(guide_memory, state)[0].shape[-1]))
+
+    def intend(self, guide_memory: Any, state: State) -> tuple[jax.Array, Any]:
+        """What the controller would do, undisturbed."""
+        position = state.info["position"]
+        target, guide_memory = self.guide.waypoint(guide_memory, state.info["maze"], position, state.info["goal"])
+        return self.controller(state.obs["proprio"], target - position), guide_memory  # pyright: ignore
+
+    def act(self, memory: tuple[Any, jax.Array], state: State, key: jax.Array) -> tuple[Action, Any]:
+        guide_memory, disturbance = memory
+        action, guide_memory = self.intend(guide_memory, state)
+        if not self.noise:
+            return Action(action, action), (guide_memory, disturbance)
+        keep_key, new_key = jax.random.split(key)
+        keep = jax.random.bernoulli(keep_key, self.hold, disturbance.shape[:1])[:, None]
+        disturbance = jnp.where(keep, disturbance, self.noise * jax.random.normal(new_key, disturbance.shape))
+        return Action(action, action + disturbance), (guide_memory, disturbance)

@@ -1,0 +1,177 @@
+"""Trajectories in memory: padded arrays that can be sharded, with the local maps left out.
+
+A map is a function of the maze and the robot's position, so it is recomputed, exactly, when a window is drawn: a
+thousand trajectories take megabytes, not gigabytes.
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from ct_envs import UserError
+from ct_envs.maze import Maze
+from ct_envs.occupancy import local_map
+
+_PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
+
+
+@struct.dataclass
+class Trajectories:
+    """N trajectories of at most T steps; entries at and after ``length`` mean nothing."""
+
+    position: Float[Array, "N T 2"]  # before the action [m]
+    proprio: Float[Array, "N T P"]
+    action: Float[Array, "N T A"]
+    reward: Float[Array, "N T"]  # after the action
+    learn: Float[Array, "N T"]  # 1 where the action is to be imitated
+    collision: Float[Array, "N T"]
+    goal: Float[Array, "N 2"]  # final goal [m]
+    maze: Int[Array, "N"]  # index into the mazes
+    length: Int[Array, "N"]
+
+    @property
+    def n(self) -> int:
+        return self.position.shape[0]
+
+    @property
+    def rtg(self) -> jax.Array:
+        """Return-to-go [N, T]: the sum of rewards from each step to the end."""
+        inside = jnp.arange(self.reward.shape[1]) < self.length[:, None]
+        reward = jnp.where(inside, self.reward, 0.0)
+        return jnp.cumsum(reward[:, ::-1], axis=1)[:, ::-1]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+
+def select(trajectories: Trajectories, index: np.ndarray) -> Trajectories:
+    """The trajectories at ``index`` (integers or bools)."""
+    return jax.tree.map(lambda leaf: leaf[index], trajectories)
+
+
+def concatenate(parts: list[Trajectories]) -> Trajectories:
+    """All trajectories of ``parts``, padded to the longest and no longer."""
+    longest = max(int(np.max(np.asarray(part.length), initial=1)) for part in parts)
+    steps = -(-longest // _PAD_STEPS) * _PAD_STEPS
+
+    def fit(leaf: np.ndarray) -> np.ndarray:
+        if leaf.ndim < 2 or leaf.shape[1] == 2 and leaf.ndim == 2:
+            return leaf
+        have = leaf.shape[1]
+        if have >= steps:
+            return leaf[:, :steps]
+        return np.pad(leaf, [(0, 0), (0, steps - have)] + [(0, 0)] * (leaf.ndim - 2))
+
+    def join(name: str) -> np.ndarray:
+        leaves = [np.asarray(getattr(part, name)) for part in parts]
+        return np.concatenate(leaves if name in ("goal", "maze", "length") else [fit(leaf) for leaf in leaves])
+
+    return Trajectories(**{name: join(name) for name in Trajectories.__dataclass_fields__})
+
+
+def save(trajectories: Trajectories, file: Path) -> None:
+    """Write to an ``.npz`` file (no pickle)."""
+    arrays = {name: np.asarray(getattr(trajectories, name)) for name in Trajectories.__dataclass_fields__}
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load(file: Path) -> Trajectories:
+    """Read what ``save`` wrote. Raises UserError naming the file if it is damaged."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            return Trajectories(**{name: data[name] for name in Trajectories.__dataclass_fields__})
+    except (OSError, KeyError, ValueError, EOFError) as bad:
+        raise UserError(f"{file}: not a trajectory file ({type(bad).__name__}); collect again") from None
+
+
+@struct.dataclass
+class Window:
+    """A batch of pieces of trajectories, S steps each."""
+
+    map: Float[Array, "B S 2 k k"]
+    proprio: Float[Array, "B S P"]
+    goal: Float[Array, "B S 2"]  # from the robot to the final goal [m]
+    action: Float[Array, "B S A"]
+    rtg: Float[Array, "B S"]
+    timestep: Int[Array, "B S"]
+    valid: Float[Array, "B S"]  # 1 where there is a step
+    learn: Float[Array, "B S"]  # 1 where the action is to be imitated
+
+
+def sample_windows(
+    key: jax.Array,
+    trajectories: Trajectories,
+    rtg: Float[Array, "N T"],
+    mazes: Maze,
+    *,
+    batch: int,
+    steps: int,
+    map_cell_m: float,
+    mirror: bool = False,
+    shift_timestep: int = 0,
+) -> Window:
+    """Draw pieces of ``steps`` steps, so that each step of the data is equally likely to be in one.
+
+    Args:
+        rtg: ``trajectories.rtg``, computed once.
+        mazes: stacked; ``trajectories.maze`` points into it.
+        mirror: also rotate and reflect each piece by a random symmetry of the square, which is exact for a robot with
+            ``planar_symmetry``.
+        shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
+    """
+    which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
+    share = jnp.cumsum(trajectories.length)
+    which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
+    length = trajectories.length[which]
+    # pieces may begin at any step that leaves them full, or at the start of a short trajectory
+    first = (jax.random.uniform(where_key, (batch,)) * (jnp.maximum(length - steps, 0) + 1)).astype(jnp.int32)
+    at = first[:, None] + jnp.arange(steps)
+    valid = at < length[:, None]
+    at = jnp.minimum(at, trajectories.position.shape[1] - 1)
+    take = lambda leaf: leaf[which[:, None], at]  # noqa: E731
+    position, goal = take(trajectories.position), trajectories.goal[which]
+    maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
+    see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
+    window = Window(
+        map=jax.vmap(see)(maze, position, goal),
+        proprio=take(trajectories.proprio),
+        goal=goal[:, None] - position,
+        action=take(trajectories.action),
+        rtg=take(rtg),
+        timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1),
+        valid=valid.astype(jnp.float32),
+        learn=valid * take(trajectories.learn),
+    )
+    return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, 8), window) if mirror else window
+
+
+def mirror_windows(symmetry: Int[Array, "B"], window: Window) -> Window:
+    """Apply symmetries of the square, 0 (identity) to 7, to pieces: bit 0 swaps x and y, bit 1 flips x, bit 2 y.
+
+    Proprioception and actions must be lists of planar vectors (``Robot.planar_symmetry``).
+    """
+    swap, flip_x, flip_y = ((symmetry >> bit) & 1 == 1 for bit in (0, 1, 2))
+    sign = jnp.stack([jnp.where(flip_x, -1.0, 1.0), jnp.where(flip_y, -1.0, 1.0)], -1)
+
+    def vectors(values: jax.Array) -> jax.Array:
+        planar = values.reshape(*values.shape[:-1], -1, 2)
+        planar = jnp.where(swap[:, None, None, None], planar[..., ::-1], planar) * sign[:, None, None, :]
+        return planar.reshape(values.shape)
+
+    def grid(values: jax.Array) -> jax.Array:
+        pick = lambda bit, a: jnp.where(bit[:, None, None, None, None], a, values)  # noqa: E731
+        values = pick(swap, jnp.swapaxes(values, -1, -2))
+        values = pick(flip_x, values[..., ::-1])
+        return pick(flip_y, values[..., ::-1, :])
+
+    return window.replace(
+        map=grid(window.map),
+        proprio=vectors(window.proprio),
+        goal=vectors(window.goal),
+        action=vectors(window.action),
+    )

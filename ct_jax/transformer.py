@@ -1,0 +1,195 @@
+"""Control Transformer: a return-conditioned causal transformer over (return-to-go, state, action) (paper, sec. III-C, E).
+
+The policy is defined as *banded* causal attention: a token of step t attends to tokens of steps t - K + 1 ... t that
+come before it. That is what acting with a key/value cache over a sliding window computes, and training uses the same
+mask, so a window of any number of steps may be trained on.
+"""
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+TOKENS = 3  # of a step: return-to-go, state, action
+GOAL_SCALE_M = 10.0  # goal vectors are divided by this
+RETURN_SCALE = 1000.0  # returns are divided by this
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of the transformer (paper, table II)."""
+
+    layers: int = 4
+    heads: int = 4
+    width: int = 128  # embedding dimension
+    context: int = 50  # K [steps] in training
+    context_acting: int = 50  # K [steps] when acting
+    dropout: float = 0.1
+    max_timestep: int = 1024  # embeddings of the absolute timestep
+    map_cell_m: float = 0.8  # side of a cell of the local map [m]
+    returns: bool = True  # condition on returns; without them this is BC-CT
+
+
+@struct.dataclass
+class Cache:
+    """Keys and values of the last steps of N episodes: a ring over ``slots`` steps of three tokens."""
+
+    keys: Float[Array, "L N slots3 H D"]
+    values: Float[Array, "L N slots3 H D"]
+    step: Int[Array, "N slots3"]  # step of the token in each place; very negative where there is none
+    now: Int[Array, ""]  # steps taken
+    action: Float[Array, "N A"]  # last action
+
+
+class MapEncoder(nn.Module):
+    """A small CNN over the local map: 5 x 5 patches, then two 3 x 3 convolutions."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, maps: Float[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
+        lead, k = maps.shape[:-3], maps.shape[-1]
+        x = jnp.moveaxis(maps.reshape(-1, 2, k, k), 1, -1)
+        x = nn.relu(nn.Conv(32, (5, 5), strides=5, padding="VALID", name="patches")(x))
+        x = nn.relu(nn.Conv(64, (3, 3), padding="VALID", name="conv")(x))
+        return nn.Dense(self.width, name="out")(x.reshape(*lead, -1))
+
+
+class Block(nn.Module):
+    """Pre-norm attention and MLP with ReLU (paper, table II)."""
+
+    config: ModelConfig
+
+    def setup(self) -> None:
+        width = self.config.width
+        self.norm_attention, self.norm_mlp = nn.LayerNorm(), nn.LayerNorm()
+        self.qkv = nn.Dense(3 * width)
+        self.project = nn.Dense(width)
+        self.up, self.down = nn.Dense(4 * width), nn.Dense(width)
+        self.dropout = nn.Dropout(self.config.dropout)
+
+    def heads(self, x: Float[Array, "B T W"]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Queries, keys and values, each [B, T, heads, W / heads]."""
+        split = self.qkv(self.norm_attention(x)).reshape(*x.shape[:-1], 3, self.config.heads, -1)
+        return split[..., 0, :, :], split[..., 1, :, :], split[..., 2, :, :]
+
+    def attend(
+        self, x: jax.Array, q: jax.Array, k: jax.Array, v: jax.Array, mask: Bool[Array, "B T M"], deterministic: bool
+    ) -> jax.Array:
+        mixed = jax.nn.dot_product_attention(q, k, v, mask=mask[:, None])
+        x = x + self.dropout(self.project(mixed.reshape(x.shape)), deterministic=deterministic)
+        hidden = self.down(nn.relu(self.up(self.norm_mlp(x))))
+        return x + self.dropout(hidden, deterministic=deterministic)
+
+
+class ControlTransformer(nn.Module):
+    """pi_theta(a_t | R_{t-K+1..t}, s_{t-K+1..t}, a_{t-K+1..t-1})."""
+
+    config: ModelConfig
+    action_size: int
+
+    def setup(self) -> None:
+        c = self.config
+        self.encode_map = MapEncoder(c.width)
+        self.embed_goal = nn.Dense(c.width)
+        self.embed_state = nn.Dense(c.width)
+        self.embed_action = nn.Dense(c.width)
+        self.embed_return = nn.Dense(c.width)
+        self.embed_timestep = nn.Embed(c.max_timestep, c.width, embedding_init=nn.initializers.normal(0.02))
+        self.norm_in, self.norm_out = nn.LayerNorm(), nn.LayerNorm()
+        self.dropout = nn.Dropout(c.dropout)
+        self.blocks = [Block(c) for _ in range(c.layers)]
+        self.predict_action = nn.Dense(self.action_size)
+
+    def _time(self, timestep: jax.Array) -> jax.Array:
+        """The embedding of the absolute timestep, shared by the tokens of a step."""
+        return self.embed_timestep(jnp.minimum(timestep, self.config.max_timestep - 1))
+
+    def _return(self, rtg: jax.Array) -> jax.Array:
+        known = rtg / RETURN_SCALE if self.config.returns else jnp.zeros_like(rtg)
+        return self.embed_return(known[..., None])
+
+    def _state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:
+        """Map, proprioception and goal joined into one embedding."""
+        goal = self.embed_goal(goal / GOAL_SCALE_M)
+        return self.embed_state(jnp.concatenate([self.encode_map(maps), proprio, goal], -1))
+
+    def __call__(
+        self,
+        maps: Float[Array, "B S 2 k k"],
+        proprio: Float[Array, "B S P"],
+        goal: Float[Array, "B S 2"],
+        action: Float[Array, "B S A"],
+        rtg: Float[Array, "B S"],
+        timestep: Int[Array, "B S"],
+        valid: Float[Array, "B S"],
+        *,
+        context: int | None = None,
+        deterministic: bool = True,
+    ) -> Float[Array, "B S A"]:
+        """Predicted actions of all steps of pieces of S steps. Steps that are not ``valid`` must come last."""
+        batch, steps = rtg.shape
+        tokens = jnp.stack([self._return(rtg), self._state(maps, proprio, goal), self.embed_action(action)], 2)
+        x = (tokens + self._time(timestep)[:, :, None]).reshape(batch, TOKENS * steps, -1)
+        x = self.dropout(self.norm_in(x), deterministic=deterministic)
+        step = jnp.arange(TOKENS * steps) // TOKENS
+        mask = band(step, step, context or self.config.context) & jnp.tri(TOKENS * steps, dtype=bool)
+        mask = mask[None] & (jnp.repeat(valid, TOKENS, 1) > 0)[:, None, :] | jnp.eye(TOKENS * steps, dtype=bool)
+        for block in self.blocks:
+            x = block.attend(x, *block.heads(x), mask, deterministic)
+        return self.predict_action(self.norm_out(x[:, 1::TOKENS]))
+
+    def act(
+        self,
+        cache: Cache,
+        maps: Float[Array, "N 2 k k"],
+        proprio: Float[Array, "N P"],
+        goal: Float[Array, "N 2"],
+        rtg: Float[Array, "N"],
+    ) -> tuple[Float[Array, "N A"], Cache]:
+        """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
+        t = cache.now
+        before = self.embed_action(cache.action) + self._time(t - 1)
+        new = [before, self._return(rtg) + self._time(t), self._state(maps, proprio, goal) + self._time(t)]
+        x = self.norm_in(jnp.stack(new, 1))
+        step_of = jnp.array([t - 1, t, t])
+        slots = cache.step.shape[1] // TOKENS
+        place = jnp.array([(t - 1) % slots * TOKENS + 2, t % slots * TOKENS, t % slots * TOKENS + 1])
+        # The first step has no action before it: its token is kept out of sight by a step that no query reaches.
+        seen_as = jnp.where(step_of < 0, -(10**6), step_of)
+        # The place of this step's action still holds one of a step long gone: out of the band, so out of sight.
+        step = cache.step.at[:, place].set(seen_as)
+        mask = band(step_of, step[0], self.config.context_acting)
+        order = jnp.array([0, 1, 2])
+        stored = jnp.full(slots * TOKENS, -1).at[place].set(order)
+        mask = mask & (stored[None, :] <= order[:, None]) | (stored[None, :] == order[:, None])
+        mask = jnp.broadcast_to(mask, (x.shape[0], *mask.shape))
+        keys, values = cache.keys, cache.values
+        for i, block in enumerate(self.blocks):
+            q, k, v = block.heads(x)
+            keys, values = keys.at[i, :, place].set(jnp.swapaxes(k, 0, 1)), values.at[i, :, place].set(jnp.swapaxes(v, 0, 1))
+            x = block.attend(x, q, keys[i], values[i], mask, True)
+        action = jnp.clip(self.predict_action(self.norm_out(x[:, 2])), -1.0, 1.0)
+        return action, Cache(keys, values, step, t + 1, action)
+
+
+def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
+    """Whether a token of step ``query`` may see one of step ``key``: not later, and less than ``context`` ago."""
+    ago = query[:, None] - key[None, :]
+    return (ago >= 0) & (ago < context)
+
+
+def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
+    """The cache before the first step of N episodes. One step more than K: the last action still sees K back."""
+    places = TOKENS * (config.context_acting + 1)
+    shape = (config.layers, n, places, config.heads, config.width // config.heads)
+    return Cache(
+        keys=jnp.zeros(shape),
+        values=jnp.zeros(shape),
+        step=jnp.full((n, places), -(10**6), jnp.int32),
+        now=jnp.zeros((), jnp.int32),
+        action=jnp.zeros((n, action_size)),
+    )

@@ -1,0 +1,24 @@
+"""The value network V_phi(s | g): the mean return of the data from a first observation (paper, sec. III-C, E)."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder
+
+
+class ValueNetwork(nn.Module):
+    """Undiscounted return from a local map, proprioception and goal; knows nothing of the past."""
+
+    width: int = 128
+
+    @nn.compact
+    def __call__(
+        self, maps: Float[Array, "*b 2 k k"], proprio: Float[Array, "*b P"], goal: Float[Array, "*b 2"]
+    ) -> Float[Array, "*b"]:
+        """Expected return [m], at most 0."""
+        distance = jnp.linalg.norm(goal, axis=-1, keepdims=True)
+        x = jnp.concatenate([MapEncoder(self.width)(maps), proprio, goal / GOAL_SCALE_M, distance / GOAL_SCALE_M], -1)
+        for _ in range(2):
+            x = nn.relu(nn.Dense(self.width)(x))
+        return -RETURN_SCALE * nn.softplus(nn.Dense(1)(x)[..., 0])

@@ -1,0 +1,318 @@
+"""Mazes as data: a pytree of arrays that a compiled program takes as an argument, never as a constant.
+
+Coordinates are SI and right-handed: x right, y up, the lower-left corner of the lower-left cell at (0, 0). Cell
+``(row, column)`` covers ``[column, column + 1) x [row, row + 1)`` times ``cell_m``; row 0 is the *lowest* row, so a
+text file is read from its last line up. Arrays are padded with wall to a multiple of ``PAD`` cells, so that mazes of
+similar size share one compiled program. Everything outside the array is wall.
+"""
+
+from importlib import resources
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
+
+from ct_envs.errors import UserError
+
+PAD = 12  # arrays are padded to a multiple of this many cells
+CELL_M = 4.0  # side of a cell [m], as in D4RL's ant mazes
+MAX_SIDE = 1024  # most cells along a side of a maze file
+_MAX_BYTES = MAX_SIDE * (MAX_SIDE + 2)
+WALL, FREE = "#", "."
+
+
+@struct.dataclass
+class Maze:
+    """A maze, or a batch of them with leading axes.
+
+    Free cells are listed region by region (4-connected), so that a goal that can be reached from a start is one
+    random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``.
+    """
+
+    walls: Bool[Array, "*b H W"]
+    free_cells: Int[Array, "*b HW"]  # flat indices row * W + column, the first n_free are meant
+    region_lo: Int[Array, "*b HW"]
+    region_hi: Int[Array, "*b HW"]
+    n_free: Int[Array, "*b"]
+    cell_m: Float[Array, "*b"]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W), padding included."""
+        return self.walls.shape[-2], self.walls.shape[-1]
+
+
+def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, int] | None = None) -> Maze:
+    """Build a ``Maze`` from a wall grid.
+
+    Args:
+        walls: bool [H, W], row 0 lowest.
+        cell_m: side of a cell [m].
+        shape: padded (H, W); by default the next multiples of ``PAD``.
+
+    Raises:
+        UserError: no free cell, or ``shape`` is too small.
+    """
+    walls = np.asarray(walls, bool)
+    if walls.ndim != 2 or walls.all():
+        raise UserError("maze has no free cell; draw free cells as '.'")
+    height, width = shape or tuple(-(-n // PAD) * PAD for n in walls.shape)
+    if height < walls.shape[0] or width < walls.shape[1]:
+        raise UserError(f"maze of {walls.shape} cells does not fit into shape {(height, width)}")
+    padded = np.ones((height, width), bool)
+    padded[: walls.shape[0], : walls.shape[1]] = walls
+
+    labels, _ = ndimage.label(~padded)
+    flat = np.flatnonzero(~padded)
+    flat = flat[np.argsort(labels.ravel()[flat], kind="stable")]
+    label = labels.ravel()[flat]
+    n, total = len(flat), height * width
+
+    def pad(values: np.ndarray) -> jax.Array:
+        return jnp.asarray(np.pad(values, (0, total - n)), jnp.int32)
+
+    return Maze(
+        walls=jnp.asarray(padded),
+        free_cells=pad(flat),
+        region_lo=pad(np.searchsorted(label, label, "left")),
+        region_hi=pad(np.searchsorted(label, label, "right")),
+        n_free=jnp.asarray(n, jnp.int32),
+        cell_m=jnp.asarray(cell_m, jnp.float32),
+    )
+
+
+def stack_mazes(mazes: list[Maze]) -> Maze:
+    """Stack mazes along a new leading axis, padding all to the largest shape."""
+    shape = (max(m.shape[0] for m in mazes), max(m.shape[1] for m in mazes))
+    grown = [make_maze(np.asarray(m.walls), cell_m=float(m.cell_m), shape=shape) for m in mazes]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grown)
+
+
+# ---------------------------------------------------------------------------------------------- reading and making
+
+
+def maze_names() -> list[str]:
+    """Names of the layouts that ship with the package."""
+    return sorted(p.name[:-4] for p in (resources.files("ct_envs") / "mazes").iterdir() if p.name.endswith(".txt"))
+
+
+def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
+    """Load a named layout, or a text file of ``#`` (wall) and ``.`` (free).
+
+    Raises:
+        UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the mend).
+    """
+    return make_maze(load_walls(name_or_file), cell_m=cell_m)
+
+
+def load_walls(name_or_file: str | Path) -> np.ndarray:
+    """The wall grid of a named layout or text file, bool [H, W], row 0 lowest, no padding. Raises as ``load_maze``."""
+    name = str(name_or_file)
+    if name in maze_names():
+        text = (resources.files("ct_envs") / "mazes" / f"{name}.txt").read_text("utf-8")
+        return parse_walls(text, source=name)
+    path = Path(name)
+    if not path.is_file():
+        raise UserError(f"no maze or file named '{name}'; named mazes: {', '.join(maze_names())}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise UserError(f"{path}: too large for a maze; at most {MAX_SIDE} x {MAX_SIDE} cells")
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError as bad:
+        line = bad.object[: bad.start].count(b"\n") + 1
+        raise UserError(f"{path}:{line}: not UTF-8 text; save the maze as plain text of '#' and '.'") from None
+    return parse_walls(text, source=str(path))
+
+
+def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
+    """Parse maze text to bool [H, W], row 0 lowest. Line ends may be CRLF; trailing blank lines are ignored.
+
+    Raises:
+        UserError: empty, ragged, unknown character, all wall, or free cells on the border.
+    """
+    lines = text.replace("\r\n", "\n").rstrip("\n \t").split("\n")
+    if lines == [""]:
+        raise UserError(f"{source}: empty; a maze is lines of '#' (wall) and '.' (free)")
+    width = len(lines[0])
+    for number, line in enumerate(lines, 1):
+        for column, char in enumerate(line, 1):
+            if char not in (WALL, FREE):
+                raise UserError(f"{source}:{number}: column {column} is {char!r}; use '#' (wall) or '.' (free)")
+        if len(line) != width:
+            raise UserError(f"{source}:{number}: {len(line)} cells, but line 1 has {width}; make all lines equal")
+    if max(width, len(lines)) > MAX_SIDE:
+        raise UserError(f"{source}: {len(lines)} x {width} cells; at most {MAX_SIDE} x {MAX_SIDE}")
+    walls = np.array([[char == WALL for char in line] for line in lines])
+    if walls.all():
+        raise UserError(f"{source}: no free cell; draw free cells as '.'")
+    border = walls.copy()
+    border[1:-1, 1:-1] = True
+    if not border.all():
+        row, column = np.argwhere(~border)[0]
+        raise UserError(f"{source}:{row + 1}: column {column + 1} is free at the border; close the maze with '#'")
+    return walls[::-1]
+
+
+def random_walls(seed: int, *, height: int = 9, width: int = 12, density: float = 1.0, loops: float = 0.3) -> np.ndarray:
+    """A random maze with one connected free region, bool [height, width], row 0 lowest.
+
+    Corridors are carved by a depth-first walk on every second cell; then ``loops`` of the walls that separate two
+    corridors are opened, and finally walls are removed at random until only ``density`` of the inner ones remain.
+
+    Args:
+        seed: any non-negative integer; the same seed gives the same maze on every machine.
+        height, width: cells, border included, at least 5.
+        density: 1 keeps all inner walls, 0 gives an empty room.
+        loops: fraction of separating walls that are opened; 0 gives a tree (no loops).
+
+    Raises:
+        UserError: a size or fraction out of range.
+    """
+    if min(height, width) < 5 or max(height, width) > MAX_SIDE:
+        raise UserError(f"random maze of {height} x {width} cells; use 5 to {MAX_SIDE} a side")
+    if not (0 <= density <= 1 and 0 <= loops <= 1):
+        raise UserError(f"random maze with density {density} and loops {loops}; both are fractions from 0 to 1")
+    rng = np.random.default_rng(seed)
+    walls = np.ones((height, width), bool)
+    stack = [(1, 1)]
+    walls[1, 1] = False
+    while stack:
+        row, column = stack[-1]
+        steps = [(0, 2), (0, -2), (2, 0), (-2, 0)]
+        options = [
+            (dr, dc)
+            for dr, dc in steps
+            if 0 < row + dr < height - 1 and 0 < column + dc < width - 1 and walls[row + dr, column + dc]
+        ]
+        if not options:
+            stack.pop()
+            continue
+        dr, dc = options[rng.integers(len(options))]
+        walls[row + dr // 2, column + dc // 2] = walls[row + dr, column + dc] = False
+        stack.append((row + dr, column + dc))
+    inner = np.zeros_like(walls)
+    inner[1:-1, 1:-1] = True
+    sides = ~walls[:-2, 1:-1] & ~walls[2:, 1:-1] | ~walls[1:-1, :-2] & ~walls[1:-1, 2:]
+    separating = walls & inner
+    separating[1:-1, 1:-1] &= sides
+    walls[separating & (rng.random(walls.shape) < loops)] = False
+    walls[walls & inner & (rng.random(walls.shape) > density)] = False
+    labels, count = ndimage.label(~walls)
+    if count > 1:  # thinning may open cells that touch nothing: fill all but the largest region
+        sizes = ndimage.sum_labels(~walls, labels, range(1, count + 1))
+        walls = labels != 1 + int(np.argmax(sizes))
+    return walls
+
+
+def draw_walls(walls: np.ndarray) -> str:
+    """The text of a wall grid (row 0 lowest), as ``parse_walls`` reads it."""
+    return "\n".join("".join(WALL if cell else FREE for cell in row) for row in np.asarray(walls)[::-1])
+
+
+def unpadded(maze: Maze) -> np.ndarray:
+    """The wall grid without padding (one ring of wall is kept), bool [H, W]."""
+    walls = np.asarray(maze.walls)
+    rows, columns = np.nonzero(~walls)
+    return walls[: rows.max() + 2, : columns.max() + 2]
+
+
+# --------------------------------------------------------------------------------------------------------- queries
+
+
+def cell_of(maze: Maze, point: Float[Array, "2"]) -> Int[Array, "2"]:
+    """(row, column) of the cell that holds a point [m]."""
+    return jnp.floor(point[::-1] / maze.cell_m).astype(jnp.int32)
+
+
+def cell_centre(maze: Maze, flat_index: Int[Array, ""]) -> Float[Array, "2"]:
+    """Centre [m] of a cell given by its flat index."""
+    width = maze.shape[1]
+    return (jnp.stack([flat_index % width, flat_index // width]) + 0.5) * maze.cell_m
+
+
+def is_wall(maze: Maze, cell: Int[Array, "... 2"]) -> Bool[Array, "..."]:
+    """Whether cells (row, column) are wall; everything outside the array is."""
+    height, width = maze.shape
+    row, column = cell[..., 0], cell[..., 1]
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return ~inside | maze.walls[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+
+
+def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
+    """Offsets (row, column) of the (2 reach + 1)^2 cells around a cell."""
+    side = jnp.arange(-reach, reach + 1)
+    return jnp.stack(jnp.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+
+
+def clearance(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall."""
+    cells = cell_of(maze, point) + _neighbourhood(1)
+    low = cells[:, ::-1] * maze.cell_m
+    outside = jnp.maximum(jnp.maximum(low - point, point - low - maze.cell_m), 0.0)
+    distance = jnp.sqrt(jnp.sum(outside**2, -1))
+    return jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
+
+
+def segment_free(
+    maze: Maze, a: Float[Array, "2"], b: Float[Array, "2"], *, radius: float, reach: int = 2
+) -> Bool[Array, ""]:
+    """Whether a disc of ``radius`` [m] swept from ``a`` to ``b`` touches no wall (exact, not sampled).
+
+    Args:
+        reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
+    """
+    cells = cell_of(maze, (a + b) / 2) + _neighbourhood(reach)
+    low = cells[:, ::-1] * maze.cell_m
+    distance = _segment_to_box(a, b, low, low + maze.cell_m)
+    return jnp.all(~is_wall(maze, cells) | (distance >= radius))
+
+
+def segment_reach(max_length: float, radius: float, cell_m: float = CELL_M) -> int:
+    """``reach`` that makes ``segment_free`` exact for segments up to ``max_length`` [m]."""
+    return int(np.ceil((max_length / 2 + radius) / cell_m))
+
+
+def _segment_to_box(
+    a: Float[Array, "2"], b: Float[Array, "2"], low: Float[Array, "n 2"], high: Float[Array, "n 2"]
+) -> Float[Array, "n"]:
+    """Distance [m] between the segment a-b and axis-aligned boxes: 0 if they meet, else an end or a corner is nearest."""
+
+    def to_box(point: jax.Array) -> jax.Array:
+        return jnp.linalg.norm(jnp.maximum(jnp.maximum(low - point, point - high), 0.0), axis=-1)
+
+    along = b - a
+    squared = jnp.maximum(along @ along, 1e-12)
+    x, y = (low[:, 0], high[:, 0]), (low[:, 1], high[:, 1])
+    corners = jnp.stack([jnp.stack([x[i], y[j]], -1) for i in (0, 1) for j in (0, 1)])  # [4, n, 2]
+    t = jnp.clip((corners - a) @ along / squared, 0.0, 1.0)
+    to_segment = jnp.linalg.norm(corners - (a + t[..., None] * along), axis=-1).min(0)
+
+    # slab test: the parameter interval in which the segment is inside the box on both axes
+    safe = jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
+    t1, t2 = (low - a) / safe, (high - a) / safe
+    enter = jnp.maximum(jnp.minimum(t1, t2).max(-1), 0.0)
+    leave = jnp.minimum(jnp.maximum(t1, t2).min(-1), 1.0)
+    return jnp.where(enter <= leave, 0.0, jnp.minimum(jnp.minimum(to_box(a), to_box(b)), to_segment))
+
+
+def sample_free(
+    key: jax.Array, maze: Maze, *, radius: float, index: Int[Array, ""] | None = None
+) -> tuple[Float[Array, "2"], Int[Array, ""]]:
+    """A random point with clearance ``radius`` [m], and the index of its cell in ``maze.free_cells``.
+
+    The cell is uniform over the free ones, or over the region of ``free_cells[index]`` if that is given; the point is
+    uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are.
+    """
+    pick, place = jax.random.split(key)
+    if index is None:
+        low, high = jnp.zeros((), jnp.int32), maze.n_free
+    else:
+        low, high = maze.region_lo[index], maze.region_hi[index]
+    chosen = jax.random.randint(pick, (), low, high)
+    slack = maze.cell_m / 2 - radius - 1e-3
+    offset = jax.random.uniform(place, (2,), minval=-1.0, maxval=1.0) * slack
+    return cell_centre(maze, maze.free_cells[chosen]) + offset, chosen

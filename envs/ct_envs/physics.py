@@ -1,0 +1,188 @@
+"""One physics contract, two engines: "mjx" (compiled by XLA) and "mujoco" (C threads behind a callback).
+
+The model holds the robot and ``WALLS`` boxes. Before each control step the boxes are put on the wall cells that the
+robot could touch during it, so one compiled program serves every maze and the number of contacts stays small. A robot
+that reaches less than half a cell in a step overlaps at most a 2 x 2 block of cells, its own (free) one among them:
+three boxes miss nothing.
+"""
+
+import functools
+import os
+import threading
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+from mujoco import mjx
+from mujoco.batch import Batch
+
+from ct_envs.errors import UserError
+from ct_envs.maze import CELL_M, Maze, cell_of, is_wall
+from ct_envs.robots import Robot, model_xml
+
+WALLS = 3
+WALL_HEIGHT_M = 2.0
+_PARKED_M = -1000.0  # height of a box that stands for no wall
+ENGINES = ("auto", "mjx", "mujoco")
+
+
+@struct.dataclass
+class PhysicsState:
+    """Everything a step needs of the past."""
+
+    qpos: Float[Array, "*b nq"]
+    qvel: Float[Array, "*b nv"]
+    qacc_warmstart: Float[Array, "*b nv"]
+
+
+class Engine(Protocol):
+    """Steps one robot, or under ``vmap`` many. Pure: the same inputs give the same state."""
+
+    name: str
+    model: mujoco.MjModel
+    n_substeps: int
+    cell_m: float
+
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
+        """One control step under ``ctrl`` [nu] with wall boxes centred at ``walls`` [WALLS, 3] (m)."""
+        ...
+
+
+def build_model(robot: Robot, *, cell_m: float = CELL_M) -> mujoco.MjModel:
+    """The robot's model with ``WALLS`` movable wall boxes of one cell.
+
+    Raises:
+        UserError: cells so small that three boxes could miss a wall.
+    """
+    reach = robot.touch_m + robot.top_speed_mps * robot.control_dt_s
+    if reach > cell_m / 2:
+        raise UserError(
+            f"cells of {cell_m} m are too small for robot '{robot.name}'; it needs at least {2 * reach:.1f} m"
+        )
+    spec = mujoco.MjSpec.from_string(model_xml(robot))
+    for i in range(WALLS):
+        body = spec.worldbody.add_body(name=f"wall{i}", mocap=True, pos=[0, 0, _PARKED_M])
+        add_wall(body, cell_m)
+    return spec.compile()
+
+
+def add_wall(body: mujoco.MjsBody, cell_m: float) -> None:
+    """Give a body the shape of a wall cell."""
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[cell_m / 2, cell_m / 2, WALL_HEIGHT_M / 2],
+        contype=0,
+        conaffinity=1,
+        condim=1,
+        solref=[0.04, 1.0],
+        rgba=[0.55, 0.6, 0.65, 1.0],
+    )
+
+
+def nearest_walls(maze: Maze, position: Float[Array, "2"]) -> Float[Array, "WALLS 3"]:
+    """Centres [m] of the wall cells a robot at ``position`` could touch in a step; boxes not needed are parked."""
+    cell = cell_of(maze, position)
+    inside = position[::-1] / maze.cell_m - cell
+    row, column = jnp.where(inside >= 0.5, 1, -1)
+    zero = jnp.zeros_like(row)
+    cells = cell + jnp.array([[row, zero], [zero, column], [row, column]])
+    centre = (cells[:, ::-1] + 0.5) * maze.cell_m
+    height = jnp.where(is_wall(maze, cells), WALL_HEIGHT_M / 2, _PARKED_M)
+    return jnp.concatenate([centre, height[:, None]], -1)
+
+
+def make_engine(name: str, robot: Robot, *, cell_m: float = CELL_M) -> Engine:
+    """The engine of that name; "auto" is "mujoco" on CPU and "mjx" on accelerators. Raises UserError."""
+    if name not in ENGINES:
+        raise UserError(f"no engine named '{name}'; engines: {', '.join(ENGINES)}")
+    if name == "auto":
+        name = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    model = build_model(robot, cell_m=cell_m)
+    substeps = round(robot.control_dt_s / model.opt.timestep)
+    return {"mjx": MjxEngine, "mujoco": MujocoEngine}[name](model, substeps, cell_m)
+
+
+class MjxEngine:
+    """Physics inside the compiled program, on any XLA device."""
+
+    name = "mjx"
+
+    def __init__(self, model: mujoco.MjModel, n_substeps: int, cell_m: float):
+        self.model, self.n_substeps, self.cell_m = model, n_substeps, cell_m
+        self._mjx_model = mjx.put_model(model)
+
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
+        data = mjx.make_data(self._mjx_model).replace(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            qacc_warmstart=state.qacc_warmstart,
+            mocap_pos=walls,
+            ctrl=ctrl,
+        )
+        data, _ = jax.lax.scan(
+            lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps
+        )
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+
+
+class MujocoEngine:
+    """Physics in MuJoCo's own C threads: on CPU about forty times the speed of MJX."""
+
+    name = "mujoco"
+
+    def __init__(self, model: mujoco.MjModel, n_substeps: int, cell_m: float):
+        self.model, self.n_substeps, self.cell_m = model, n_substeps, cell_m
+        self._batches: dict[int, tuple[Batch, dict[str, np.ndarray]]] = {}
+        self._lock = threading.Lock()  # a Batch serves one caller at a time
+
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+        return jax.pure_callback(self._step, shapes, state, ctrl, walls, vmap_method="broadcast_all")
+
+    def _step(self, state: PhysicsState, ctrl: np.ndarray, walls: np.ndarray) -> PhysicsState:
+        """Whole states in, whole states out; NumPy only, since JAX must not be called from a callback."""
+        inputs = {
+            "qpos": np.asarray(state.qpos),
+            "qvel": np.asarray(state.qvel),
+            "qacc_warmstart": np.asarray(state.qacc_warmstart),
+            "ctrl": np.asarray(ctrl),
+            "mocap_pos": np.asarray(walls),
+        }
+        lead = inputs["qpos"].shape[:-1]
+        n = int(np.prod(lead, dtype=int))
+        with self._lock:
+            batch, views = self._batch(n)
+            for name, value in inputs.items():
+                views[name][:] = value.reshape(views[name].shape)
+            batch.step(nstep=self.n_substeps)
+            return PhysicsState(
+                **{
+                    name: views[name].astype(inputs[name].dtype).reshape(*lead, -1)
+                    for name in ("qpos", "qvel", "qacc_warmstart")
+                }
+            )
+
+    def _batch(self, n: int) -> tuple[Batch, dict[str, np.ndarray]]:
+        if n not in self._batches:
+            threads = min(n, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+            batch = Batch(self.model, nsim=n, nthread=threads)
+            names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos")
+            self._batches[n] = batch, {name: batch.bind(name) for name in names}
+        return self._batches[n]
+
+
+@functools.cache
+def static_model(robot: Robot, walls: bytes, height: int, width: int, cell_m: float = CELL_M) -> mujoco.MjModel:
+    """A model with every wall built in: slow, and the truth that the movable boxes are tested against."""
+    spec = mujoco.MjSpec.from_string(model_xml(robot))
+    grid = np.frombuffer(walls, bool).reshape(height, width)
+    for row, column in np.argwhere(grid):
+        body = spec.worldbody.add_body(
+            pos=[(column + 0.5) * cell_m, (row + 0.5) * cell_m, WALL_HEIGHT_M / 2]
+        )
+        add_wall(body, cell_m)
+    return spec.compile()
