@@ -33,14 +33,29 @@ class CollectConfig:
 
 
 def run_episodes(
-    env: MazeEnv, policy: object, state: State, memory: object, key: jax.Array, *, chunk: int = 25, limit: int
+    env: MazeEnv,
+    policy: object,
+    state: State,
+    memory: object,
+    key: jax.Array,
+    *,
+    chunk: int = 25,
+    limit: int,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[State, object, Steps]:
-    """Roll out until all episodes are over, or ``limit`` steps, in compiled chunks; steps as NumPy [T, N, ...]."""
+    """Roll out until all episodes are over, or ``limit`` steps, in compiled chunks; steps as NumPy [T, N, ...].
+
+    Args:
+        on_progress: told (steps, episodes that are over) after every ``chunk``.
+    """
     parts = []
     for i in range(-(-limit // chunk)):
         state, memory, steps = rollout(env, policy, state, memory, jax.random.fold_in(key, i), chunk)  # pyright: ignore
         parts.append(jax.tree.map(np.asarray, steps))
-        if bool((np.asarray(state.done) > 0).all()):
+        over = int((np.asarray(state.done) > 0).sum())
+        if on_progress is not None:
+            on_progress((i + 1) * chunk, over)
+        if over == state.done.shape[0]:
             break
     return state, memory, jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
@@ -86,7 +101,7 @@ def make_guide(name: str, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | Explor
     """The guide of that name. Raises UserError with the valid names."""
     radius, cell_m = env.robot.radius_m, env.engine.cell_m
     if name == "explorer":
-        return ExplorerGuide(radius, env.map_cell_m, cell_m, prm.connect_m)
+        return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, prm.connect_m)
     if name not in GUIDES:
         raise UserError(f"no guide named '{name}'; guides: {', '.join(GUIDES)}")
     return RoadmapGuide(radius + prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")

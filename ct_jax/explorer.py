@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from ct_envs.maze import Maze, cell_of, is_wall, segment_free, segment_reach
+from ct_envs.maze import Maze, cell_of, in_sight, is_wall, segment_reach
 from ct_envs.occupancy import MAP_CELLS
 
 
@@ -40,7 +40,7 @@ class ExplorerGuide:
         """Targets [N, 2] (m), and what has been seen by now."""
         seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
         believed = maze.replace(walls=maze.walls & seen.cells)
-        to_go = _distances(believed, jax.vmap(cell_of)(maze, goal))
+        to_go = _distances(believed, goal)
         return jax.vmap(self._choose)(believed, to_go, position, goal), seen
 
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
@@ -62,18 +62,20 @@ class ExplorerGuide:
         rest = jnp.concatenate([jnp.zeros(1), jnp.where(is_wall(believed, cells), jnp.inf, on_grid)])
         away = jnp.linalg.norm(points - position, axis=-1)
         reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
-        free = jax.vmap(lambda p: segment_free(believed, position, p, radius=self.radius_m, reach=reach))(points)
-        # The robot may touch a wall and so see nothing at full width: then its own cell's centre will do.
+        free = jax.vmap(lambda p: in_sight(believed, position, p, radius=self.radius_m, reach=reach))(points)
+        # If nothing is in sight, the centre of the robot's own cell will do.
         usable = (free & (away <= self.look_m)) | (jnp.arange(len(points)) == 1 + len(offsets) // 2)
         return points[jnp.argmin(jnp.where(usable, away + rest, jnp.inf))]
 
 
 def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
-    """Way [m] to the goal's cell over 4-connected cells that are not wall, for N mazes at once (value iteration)."""
+    """Way [m] from cell centres to goals [N, 2] (m), over 4-connected cells that are not wall (value iteration)."""
     height, width = maze.shape
-    at_goal = (jnp.arange(height)[:, None] == goal[:, :1, None]) & (jnp.arange(width) == goal[:, 1:, None])
+    cell = jax.vmap(cell_of)(maze, goal)
+    at_goal = (jnp.arange(height)[:, None] == cell[:, :1, None]) & (jnp.arange(width) == cell[:, 1:, None])
+    last = jnp.linalg.norm((cell[:, ::-1] + 0.5) * maze.cell_m[:, None] - goal, axis=-1)
     cost = jnp.where(maze.walls, jnp.inf, maze.cell_m[:, None, None])
-    start = jnp.where(at_goal, 0.0, jnp.inf)
+    start = jnp.where(at_goal, last[:, None, None], jnp.inf)
 
     def sweep(carry):
         d, _ = carry

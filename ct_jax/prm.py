@@ -18,8 +18,9 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from ct_envs.errors import UserError
-from ct_envs.maze import Maze, clearance, segment_free, segment_reach, unpadded
+from ct_envs.maze import Maze, clearance, in_sight, segment_free, segment_reach, unpadded
 
+_CANDIDATES = 64  # nearest points among which a new waypoint is sought
 NO_HOP = -1  # entry of the next-hop table where there is no path
 
 
@@ -70,7 +71,7 @@ class Roadmap:
     points: np.ndarray  # float32 [n, 2], [m]
     edges: np.ndarray  # int32 [m, 2], each once, first < second
     maze: Maze
-    radius_m: float  # kept clear by every edge
+    radius_m: float  # of the robot; every edge keeps it clear, and edges between samples the margin too
     config: PrmConfig
 
     @functools.cached_property
@@ -90,7 +91,7 @@ class Roadmap:
         """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
         ends = np.asarray([start, goal], np.float32)
         for name, point in zip(("start", "goal"), ends, strict=True):
-            if float(_clearances(self.maze, jnp.asarray(point[None]))[0]) < self.radius_m:
+            if not float(_clearances(self.maze, jnp.asarray(point[None]))[0]) >= self.radius_m:
                 return NoPath(tuple(ends[0]), tuple(ends[1]), f"the {name} is inside a wall or touches one")
         grown = extend(self, ends)
         n = len(self.points)
@@ -116,30 +117,34 @@ def build_roadmap(key: jax.Array, maze: Maze, *, radius_m: float, config: PrmCon
     radius = radius_m + config.margin_m
     seed = np.asarray(jax.random.key_data(key)).astype(np.uint32)
     rng = np.random.default_rng(seed)
-    return connect(_sample_points(rng, maze, radius, config.samples), maze, radius, config)
+    return _connect(_sample_points(rng, maze, radius, config.samples), maze, radius_m, config)
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
-    """The roadmap with further points [k, 2] (m), appended in order and connected as samples are."""
+    """The roadmap with further points [k, 2] (m), appended in order and connected wherever the bare robot fits."""
     everything = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
-    return connect(everything, roadmap.maze, roadmap.radius_m, roadmap.config)
+    return _connect(everything, roadmap.maze, roadmap.radius_m, roadmap.config)
 
 
-def connect(points: np.ndarray, maze: Maze, radius: float, config: PrmConfig) -> Roadmap:
-    """Join all pairs of points within the connect distance whose straight way is free, in one batched check."""
+def _connect(points: np.ndarray, maze: Maze, radius_m: float, config: PrmConfig) -> Roadmap:
+    """Join all pairs of points within the connect distance whose straight way is free, in one batched check.
+
+    Edges between the first ``config.samples`` points keep the margin; the others, to given points, only the radius.
+    """
     pairs = cKDTree(points).query_pairs(config.connect_m, output_type="ndarray").astype(np.int32)
-    reach = segment_reach(config.connect_m, radius, float(maze.cell_m))
+    reach = segment_reach(config.connect_m, radius_m + config.margin_m, float(maze.cell_m))
     padded = np.zeros((_bucket(len(pairs)), 2), np.int32)
     padded[: len(pairs)] = pairs
-    free = np.asarray(_segments_free(maze, jnp.asarray(points[padded]), jnp.float32(radius), reach))[: len(pairs)]
-    edges = pairs[free]
+    clear = radius_m + config.margin_m * (padded < config.samples).all(1)
+    free = _segments_free(maze, jnp.asarray(points[padded]), jnp.asarray(clear, jnp.float32), reach)
+    edges = pairs[np.asarray(free)[: len(pairs)]]
     graph = nx.Graph()
     graph.add_nodes_from(range(len(points)))
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     graph.add_weighted_edges_from(
         zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True)
     )
-    return Roadmap(graph, points, edges, maze, radius, config)
+    return Roadmap(graph, points, edges, maze, radius_m, config)
 
 
 def _bucket(n: int) -> int:
@@ -148,8 +153,8 @@ def _bucket(n: int) -> int:
 
 
 @functools.partial(jax.jit, static_argnames="reach")
-def _segments_free(maze: Maze, ends: Float[Array, "m 2 2"], radius: jax.Array, reach: int) -> jax.Array:
-    return jax.vmap(lambda e: segment_free(maze, e[0], e[1], radius=radius, reach=reach))(ends)
+def _segments_free(maze: Maze, ends: Float[Array, "m 2 2"], radius: Float[Array, "m"], reach: int) -> jax.Array:
+    return jax.vmap(lambda e, r: segment_free(maze, e[0], e[1], radius=r, reach=reach))(ends, radius)
 
 
 @jax.jit
@@ -201,7 +206,7 @@ class RoadmapGuide:
     step, the point in sight that makes the shortest way to the goal: smoother, and it recovers from any disturbance.
     """
 
-    radius_m: float  # kept clear when a new waypoint is chosen [m]
+    radius_m: float  # kept clear on the way to a waypoint, where its ends have the room [m]
     look_m: float = 10.0  # farthest waypoint that is chosen anew [m]
     cell_m: float = 4.0
     waypoint_tolerance_m: float = 0.5
@@ -233,30 +238,32 @@ class RoadmapGuide:
         reached = jnp.linalg.norm(at - position, axis=-1) < self.waypoint_tolerance_m
         hop = plan.next_hop[row, plan.waypoint]
         waypoint = jnp.where(reached & (hop != NO_HOP), hop, plan.waypoint)
-        # A robot that grazes a wall still sees its waypoint: hence less than its radius.
-        sees = jax.vmap(functools.partial(self._sees, radius=0.8 * self.radius_m))
-        lost = ~sees(maze, position, plan.points[row, waypoint][:, None])[:, 0]
+        lost = ~jax.vmap(self._sees)(maze, position, plan.points[row, waypoint][:, None])[:, 0]
         waypoint = jax.lax.cond(
             jnp.any(lost),
             lambda: jnp.where(lost, self._choose(plan, maze, position), waypoint),
             lambda: waypoint,
         )
         plan = plan.replace(waypoint=waypoint)
-        last = (waypoint == plan.goal_node) & sees(maze, position, goal[:, None])[:, 0]
+        last = (waypoint == plan.goal_node) & jax.vmap(self._sees)(maze, position, goal[:, None])[:, 0]
         return jnp.where(last[:, None], goal, plan.points[row, waypoint]), plan
 
     def _choose(self, plan: Following, maze: Maze, position: jax.Array) -> Int[Array, "N"]:
         """The point in sight that makes the shortest way to the goal; the nearest point where none is in sight."""
         away = jnp.linalg.norm(plan.points - position[:, None], axis=-1)
-        free = jax.vmap(functools.partial(self._sees, radius=self.radius_m))(maze, position, plan.points)
-        way = jnp.where(free & (away <= self.look_m), away + plan.to_go, jnp.inf)
-        return jnp.where(jnp.isfinite(way).any(-1), jnp.argmin(way, -1), jnp.argmin(away, -1))
+        _, near = jax.lax.top_k(-away, min(_CANDIDATES, away.shape[1]))
+        pick = lambda leaf: jnp.take_along_axis(leaf, near, 1)  # noqa: E731
+        points = jnp.take_along_axis(plan.points, near[..., None], 1)
+        free = jax.vmap(self._sees)(maze, position, points)
+        way = jnp.where(free & (pick(away) <= self.look_m), pick(away) + pick(plan.to_go), jnp.inf)
+        best = jnp.where(jnp.isfinite(way).any(-1), jnp.argmin(way, -1), 0)
+        return jnp.take_along_axis(near, best[:, None], 1)[:, 0]
 
     def _nearest_in_sight(self, points: jax.Array, maze: Maze, goal: jax.Array) -> jax.Array:
-        away = jnp.linalg.norm(points - goal, axis=-1)
-        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, radius=self.radius_m), 0.0, 1e6))
+        away = jnp.linalg.norm(points - goal[None], axis=-1)
+        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points), 0.0, 1e6))
 
-    def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "n 2"], *, radius: float) -> jax.Array:
+    def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "n 2"]) -> jax.Array:
         reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
-        free = jax.vmap(lambda p: segment_free(maze, position, p, radius=radius, reach=reach))(points)
+        free = jax.vmap(lambda p: in_sight(maze, position, p, radius=self.radius_m, reach=reach))(points)
         return free & (jnp.linalg.norm(points - position, axis=-1) <= 1.5 * self.look_m)

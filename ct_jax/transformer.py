@@ -45,16 +45,23 @@ class Cache:
 
 
 class MapEncoder(nn.Module):
-    """A small CNN over the local map: 5 x 5 patches, then two 3 x 3 convolutions."""
+    """A small CNN over the local map: a 5 x 5 convolution of stride 5, a 3 x 3 one, and a dense layer.
+
+    The convolutions are written as matrix products over patches: XLA's convolutions are many times slower on CPU when
+    they stand inside a ``scan``, and the training loop is one.
+    """
 
     width: int
+    patch: int = 5
 
     @nn.compact
     def __call__(self, maps: Float[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
-        lead, k = maps.shape[:-3], maps.shape[-1]
-        x = jnp.moveaxis(maps.reshape(-1, 2, k, k), 1, -1)
-        x = nn.relu(nn.Conv(32, (5, 5), strides=5, padding="VALID", name="patches")(x))
-        x = nn.relu(nn.Conv(64, (3, 3), padding="VALID", name="conv")(x))
+        lead, n, p = maps.shape[:-3], maps.shape[-1] // self.patch, self.patch
+        x = maps.reshape(*lead, 2, n, p, n, p)
+        x = jnp.moveaxis(x, (-5, -3, -1), (-3, -2, -1)).reshape(*lead, n, n, 2 * p * p)
+        x = nn.relu(nn.Dense(32, name="conv5")(x))
+        rows = [x[..., i : n - 2 + i, j : n - 2 + j, :] for i in range(3) for j in range(3)]
+        x = nn.relu(nn.Dense(64, name="conv3")(jnp.concatenate(rows, -1)))
         return nn.Dense(self.width, name="out")(x.reshape(*lead, -1))
 
 
@@ -104,15 +111,15 @@ class ControlTransformer(nn.Module):
         self.blocks = [Block(c) for _ in range(c.layers)]
         self.predict_action = nn.Dense(self.action_size)
 
-    def _time(self, timestep: jax.Array) -> jax.Array:
+    def _embed_time(self, timestep: jax.Array) -> jax.Array:
         """The embedding of the absolute timestep, shared by the tokens of a step."""
         return self.embed_timestep(jnp.minimum(timestep, self.config.max_timestep - 1))
 
-    def _return(self, rtg: jax.Array) -> jax.Array:
+    def _embed_return(self, rtg: jax.Array) -> jax.Array:
         known = rtg / RETURN_SCALE if self.config.returns else jnp.zeros_like(rtg)
         return self.embed_return(known[..., None])
 
-    def _state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:
+    def _embed_state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:
         """Map, proprioception and goal joined into one embedding."""
         goal = self.embed_goal(goal / GOAL_SCALE_M)
         return self.embed_state(jnp.concatenate([self.encode_map(maps), proprio, goal], -1))
@@ -132,8 +139,8 @@ class ControlTransformer(nn.Module):
     ) -> Float[Array, "B S A"]:
         """Predicted actions of all steps of pieces of S steps. Steps that are not ``valid`` must come last."""
         batch, steps = rtg.shape
-        tokens = jnp.stack([self._return(rtg), self._state(maps, proprio, goal), self.embed_action(action)], 2)
-        x = (tokens + self._time(timestep)[:, :, None]).reshape(batch, TOKENS * steps, -1)
+        tokens = jnp.stack([self._embed_return(rtg), self._embed_state(maps, proprio, goal), self.embed_action(action)], 2)
+        x = (tokens + self._embed_time(timestep)[:, :, None]).reshape(batch, TOKENS * steps, -1)
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
         step = jnp.arange(TOKENS * steps) // TOKENS
         mask = band(step, step, context or self.config.context) & jnp.tri(TOKENS * steps, dtype=bool)
@@ -152,8 +159,8 @@ class ControlTransformer(nn.Module):
     ) -> tuple[Float[Array, "N A"], Cache]:
         """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
         t = cache.now
-        before = self.embed_action(cache.action) + self._time(t - 1)
-        new = [before, self._return(rtg) + self._time(t), self._state(maps, proprio, goal) + self._time(t)]
+        before = self.embed_action(cache.action) + self._embed_time(t - 1)
+        new = [before, self._embed_return(rtg) + self._embed_time(t), self._embed_state(maps, proprio, goal) + self._embed_time(t)]
         x = self.norm_in(jnp.stack(new, 1))
         step_of = jnp.array([t - 1, t, t])
         slots = cache.step.shape[1] // TOKENS

@@ -18,6 +18,7 @@ if _workers > 1:
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 # Compiled programs are kept between runs. A cache that others can write to can run their code: ours only.
@@ -54,3 +55,19 @@ def jit_disabled():
     """Runs the test operation by operation, so that asserts and Python errors inside jitted code are seen."""
     with jax.disable_jit():
         yield
+
+
+@pytest.fixture(scope="session")
+def wall_distance():
+    """Distance [m] from points [..., 2] to the nearest wall of a grid [H, W], one wall after the other, in float64."""
+
+    def distance(walls, points, cell_m=4.0):
+        points = np.asarray(points, np.float64)
+        nearest = np.full(points.shape[:-1], np.inf)
+        for row, column in np.argwhere(np.pad(np.asarray(walls), 1, constant_values=True)) - 1:
+            centre = (np.array([column, row]) + 0.5) * cell_m
+            beyond = np.maximum(np.abs(points - centre) - cell_m / 2, 0.0)
+            nearest = np.minimum(nearest, np.hypot(beyond[..., 0], beyond[..., 1]))
+        return nearest
+
+    return distance

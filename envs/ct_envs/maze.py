@@ -55,7 +55,7 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
         shape: padded (H, W); by default the next multiples of ``PAD``.
 
     Raises:
-        UserError: no free cell, or ``shape`` is too small.
+        UserError: no free cell, free cells on the border, or ``shape`` is too small.
     """
     walls = np.asarray(walls, bool)
     if walls.ndim != 2 or walls.all():
@@ -65,6 +65,8 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
         raise UserError(f"maze of {walls.shape} cells does not fit into shape {(height, width)}")
     padded = np.ones((height, width), bool)
     padded[: walls.shape[0], : walls.shape[1]] = walls
+    if not (padded[[0, -1]].all() and padded[:, [0, -1]].all()):
+        raise UserError("maze is free at the border; close it with walls")
 
     labels, _ = ndimage.label(~padded)
     flat = np.flatnonzero(~padded)
@@ -137,15 +139,15 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     lines = text.replace("\r\n", "\n").rstrip("\n \t").split("\n")
     if lines == [""]:
         raise UserError(f"{source}: empty; a maze is lines of '#' (wall) and '.' (free)")
-    width = len(lines[0])
+    width, widest = len(lines[0]), max(map(len, lines))
+    if max(widest, len(lines)) > MAX_SIDE:  # before a look at each of its cells
+        raise UserError(f"{source}: {len(lines)} x {widest} cells; at most {MAX_SIDE} x {MAX_SIDE}")
     for number, line in enumerate(lines, 1):
         for column, char in enumerate(line, 1):
             if char not in (WALL, FREE):
                 raise UserError(f"{source}:{number}: column {column} is {char!r}; use '#' (wall) or '.' (free)")
         if len(line) != width:
             raise UserError(f"{source}:{number}: {len(line)} cells, but line 1 has {width}; make all lines equal")
-    if max(width, len(lines)) > MAX_SIDE:
-        raise UserError(f"{source}: {len(lines)} x {width} cells; at most {MAX_SIDE} x {MAX_SIDE}")
     walls = np.array([[char == WALL for char in line] for line in lines])
     if walls.all():
         raise UserError(f"{source}: no free cell; draw free cells as '.'")
@@ -250,25 +252,36 @@ def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
 
 def clearance(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
     """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall."""
-    cells = cell_of(maze, point) + _neighbourhood(1)
+    cells = cell_of(maze, point)[None] + _neighbourhood(1)
     low = cells[:, ::-1] * maze.cell_m
-    outside = jnp.maximum(jnp.maximum(low - point, point - low - maze.cell_m), 0.0)
+    outside = jnp.maximum(jnp.maximum(low - point[None], point[None] - low - maze.cell_m), 0.0)
     distance = jnp.sqrt(jnp.sum(outside**2, -1))
     return jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
 
 
 def segment_free(
-    maze: Maze, a: Float[Array, "2"], b: Float[Array, "2"], *, radius: float, reach: int = 2
+    maze: Maze, a: Float[Array, "2"], b: Float[Array, "2"], *, radius: float | Float[Array, ""], reach: int = 2
 ) -> Bool[Array, ""]:
     """Whether a disc of ``radius`` [m] swept from ``a`` to ``b`` touches no wall (exact, not sampled).
 
     Args:
         reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
     """
-    cells = cell_of(maze, (a + b) / 2) + _neighbourhood(reach)
+    cells = cell_of(maze, (a + b) / 2)[None] + _neighbourhood(reach)
     low = cells[:, ::-1] * maze.cell_m
     distance = _segment_to_box(a, b, low, low + maze.cell_m)
-    return jnp.all(~is_wall(maze, cells) | (distance >= radius))
+    return jnp.all(~is_wall(maze, cells) | ((distance >= radius) & (distance > 0)))
+
+
+def in_sight(
+    maze: Maze, a: Float[Array, "2"], b: Float[Array, "2"], *, radius: float, reach: int = 2
+) -> Bool[Array, ""]:
+    """``segment_free`` for a disc of ``radius`` [m], or as large as both ends have room for.
+
+    So a robot that grazes a wall still sees the points it can walk to.
+    """
+    room = 0.98 * jnp.minimum(clearance(maze, a), clearance(maze, b))
+    return segment_free(maze, a, b, radius=jnp.minimum(radius, room), reach=reach)
 
 
 def segment_reach(max_length: float, radius: float, cell_m: float = CELL_M) -> int:
@@ -281,22 +294,24 @@ def _segment_to_box(
 ) -> Float[Array, "n"]:
     """Distance [m] between the segment a-b and axis-aligned boxes: 0 if they meet, else an end or a corner is nearest."""
 
-    def to_box(point: jax.Array) -> jax.Array:
-        return jnp.linalg.norm(jnp.maximum(jnp.maximum(low - point, point - high), 0.0), axis=-1)
-
     along = b - a
+    low, high = low - a[None], high - a[None]  # from here on as seen from a
+
+    def to_box(point: jax.Array) -> jax.Array:
+        return jnp.linalg.norm(jnp.maximum(jnp.maximum(low - point[None], point[None] - high), 0.0), axis=-1)
+
     squared = jnp.maximum(along @ along, 1e-12)
     x, y = (low[:, 0], high[:, 0]), (low[:, 1], high[:, 1])
     corners = jnp.stack([jnp.stack([x[i], y[j]], -1) for i in (0, 1) for j in (0, 1)])  # [4, n, 2]
-    t = jnp.clip((corners - a) @ along / squared, 0.0, 1.0)
-    to_segment = jnp.linalg.norm(corners - (a + t[..., None] * along), axis=-1).min(0)
+    t = jnp.clip(corners @ along / squared, 0.0, 1.0)
+    to_segment = jnp.linalg.norm(corners - t[..., None] * along[None, None], axis=-1).min(0)
 
     # slab test: the parameter interval in which the segment is inside the box on both axes
-    safe = jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
-    t1, t2 = (low - a) / safe, (high - a) / safe
+    safe = jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)[None]
+    t1, t2 = low / safe, high / safe
     enter = jnp.maximum(jnp.minimum(t1, t2).max(-1), 0.0)
     leave = jnp.minimum(jnp.maximum(t1, t2).min(-1), 1.0)
-    return jnp.where(enter <= leave, 0.0, jnp.minimum(jnp.minimum(to_box(a), to_box(b)), to_segment))
+    return jnp.where(enter <= leave, 0.0, jnp.minimum(jnp.minimum(to_box(jnp.zeros_like(along)), to_box(along)), to_segment))
 
 
 def sample_free(

@@ -6,6 +6,7 @@ have its own and a new maze compiles nothing.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State
 from flax import struct
 from jaxtyping import Array, Float, Int
@@ -31,7 +32,7 @@ class MazeEnv(Env):
 
     Observation: a dict of ``proprio`` [P] (for the point: its velocity, m/s), ``goal`` [2] (from the robot to the
     goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action: [-1, 1]^nu. An episode ends with success (within the
-    goal tolerance), with a failure (a state that is not finite) or, as truncation, at the horizon. ``state.info``
+    goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon. ``state.info``
     holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``steps``, ``position``, ``goal``,
     ``maze``, ``tasks`` and ``key``.
     """
@@ -63,8 +64,10 @@ class MazeEnv(Env):
             cell_m: side of the maze's cells [m].
 
         Raises:
-            UserError: unknown robot or engine, or cells too small for the robot.
+            UserError: unknown robot or engine, cells too small for the robot, or a maze with cells of another size.
         """
+        if maze is not None and not np.allclose(maze.cell_m, cell_m):
+            raise UserError(f"the maze's cells are not {cell_m} m wide; give MazeEnv the maze's own cell_m")
         self.robot = get_robot(robot) if isinstance(robot, str) else robot
         self.engine = make_engine(engine, self.robot, cell_m=cell_m)
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
@@ -135,9 +138,11 @@ class MazeEnv(Env):
         """One control step. With ``auto_reset`` a finished state comes back as the first of the next episode, with the
         reward, ``done`` and outcome of the finished one."""
         before = state.pipeline_state
-        walls = nearest_walls(state.info["maze"], state.info["position"])
-        physics = self.engine.step(before, jnp.clip(action, -1.0, 1.0), walls)
-        finite = jnp.all(jnp.isfinite(physics.qpos)) & jnp.all(jnp.isfinite(physics.qvel))
+        walls = nearest_walls(state.info["maze"], before.qpos[:2])
+        ctrl = jnp.clip(action, -1.0, 1.0)
+        physics = self.engine.step(before, ctrl, walls)
+        # The action too: MuJoCo would read one that is not a number as zero, and carry on.
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([physics.qpos, physics.qvel, ctrl])))
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
 
         info = dict(state.info)

@@ -23,7 +23,7 @@ def local_map(
 ) -> Float[Array, "2 k k"]:
     """The local map at ``position`` [m] with a goal at ``goal`` [m]; ``cell_m`` is the side of a map cell [m]."""
     offset = (jnp.arange(cells) - (cells - 1) / 2) * cell_m
-    column, row = (jnp.floor((position[:, None] + offset) / maze.cell_m)).astype(jnp.int32)
+    column, row = (jnp.floor((position[:, None] + offset[None]) / maze.cell_m)).astype(jnp.int32)
     height, width = maze.shape
     # Padding and border are wall, so a point outside the array may read the nearest cell inside it.
     walls = maze.walls[jnp.clip(row, 0, height - 1)[:, None], jnp.clip(column, 0, width - 1)[None, :]]

@@ -61,7 +61,8 @@ def build_model(robot: Robot, *, cell_m: float = CELL_M) -> mujoco.MjModel:
     reach = robot.touch_m + robot.top_speed_mps * robot.control_dt_s
     if reach > cell_m / 2:
         raise UserError(
-            f"cells of {cell_m} m are too small for robot '{robot.name}'; it needs at least {2 * reach:.1f} m"
+            f"cells of {cell_m} m are too small for robot '{robot.name}'; "
+            f"it needs at least {np.ceil(20 * reach) / 10:.1f} m"
         )
     spec = mujoco.MjSpec.from_string(model_xml(robot))
     for i in range(WALLS):
@@ -89,7 +90,7 @@ def nearest_walls(maze: Maze, position: Float[Array, "2"]) -> Float[Array, "WALL
     inside = position[::-1] / maze.cell_m - cell
     row, column = jnp.where(inside >= 0.5, 1, -1)
     zero = jnp.zeros_like(row)
-    cells = cell + jnp.array([[row, zero], [zero, column], [row, column]])
+    cells = cell[None] + jnp.array([[row, zero], [zero, column], [row, column]])
     centre = (cells[:, ::-1] + 0.5) * maze.cell_m
     height = jnp.where(is_wall(maze, cells), WALL_HEIGHT_M / 2, _PARKED_M)
     return jnp.concatenate([centre, height[:, None]], -1)

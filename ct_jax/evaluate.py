@@ -1,0 +1,153 @@
+"""Evaluation on fixed start-goal pairs: success, return, SPL, collisions and time-outs, with intervals."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from ct_envs import MazeEnv
+from ct_envs.maze import Maze, sample_free
+from ct_jax.collect import plan_memory, run_episodes, start_episodes, make_guide
+from ct_jax.prm import PlanTable, PrmConfig, Roadmap, build_roadmap, extend
+from ct_jax.policy import TransformerPolicy
+from ct_jax.rollout import Controller, Guided, Steps
+
+METHODS = ("ct", "planner", "explorer")
+RETURN_UNIT = 100.0  # the paper's scaled return is the raw one over this
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Starts and goals of an evaluation, drawn once from a seed, and the shortest ways between them."""
+
+    start: np.ndarray  # [n, 2], [m]
+    goal: np.ndarray
+    shortest_m: np.ndarray  # [n], on a dense roadmap
+    seed: int
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What one method did on the pairs."""
+
+    success: np.ndarray  # bool [n]
+    collided: np.ndarray  # bool [n]: touched a wall at any step
+    timeout: np.ndarray  # bool [n]
+    steps: np.ndarray  # [n]
+    returns: np.ndarray  # [n], raw
+    travelled_m: np.ndarray  # [n]
+    path: np.ndarray  # float32 [T, n, 2]: positions, for pictures
+    pairs: Pairs
+    wall_s: float
+    asked: np.ndarray | None = None  # return asked for at the start
+
+    def summary(self) -> dict[str, Any]:
+        """Rates and means; intervals are 95 %: Wilson for rates, bootstrap over episodes for means."""
+        spl = self.success * self.pairs.shortest_m / np.maximum(self.pairs.shortest_m, self.travelled_m)
+        rows: dict[str, Any] = {"success_rate": float(self.success.mean()), "success_ci95": wilson(self.success)}
+        rows |= {"return_mean": float(self.returns.mean()), "return_ci95": bootstrap(self.returns)}
+        rows |= {"return_scaled": float(self.returns.mean() / RETURN_UNIT)}
+        rows |= {"return_scaled_ci95": [x / RETURN_UNIT for x in bootstrap(self.returns)]}
+        rows |= {"spl": float(spl.mean()), "spl_ci95": bootstrap(spl)}
+        rows |= {"collision_rate": float(self.collided.mean()), "collision_ci95": wilson(self.collided)}
+        rows |= {"timeout_rate": float(self.timeout.mean()), "timeout_ci95": wilson(self.timeout)}
+        return rows | {"steps_mean": float(self.steps.mean()), "wall_s": round(self.wall_s, 2)}
+
+
+def wilson(outcomes: np.ndarray) -> list[float]:
+    """95 % interval of a rate."""
+    interval = stats.binomtest(int(np.sum(outcomes)), len(outcomes)).proportion_ci(0.95, method="wilson")
+    return [float(interval.low), float(interval.high)]
+
+
+def bootstrap(values: np.ndarray) -> list[float]:
+    """95 % interval of a mean (percentile bootstrap, fixed seed)."""
+    if len(values) < 2 or np.ptp(values) == 0:
+        return [float(np.mean(values))] * 2
+    result = stats.bootstrap((values,), np.mean, n_resamples=2000, rng=np.random.default_rng(0), method="percentile")
+    return [float(result.confidence_interval.low), float(result.confidence_interval.high)]
+
+
+def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: float) -> Pairs:
+    """Draw pairs of free points of one region, a goal never within twice the tolerance of its start."""
+
+    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        a, b = jax.random.split(key)
+        start, region = sample_free(a, maze, radius=radius_m)
+        return start, sample_free(b, maze, radius=radius_m, index=region)[0]
+
+    start, goal = map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(seed), 8 * n + 64)))
+    apart = np.flatnonzero(np.linalg.norm(start - goal, axis=1) > 2 * tolerance_m)[:n]
+    start, goal = start[apart], goal[apart]
+    dense = PrmConfig(samples=1000)
+    table = extend(build_roadmap(jax.random.key(seed), maze, radius_m=radius_m, config=dense), _join(start, goal)).table
+    row = np.arange(len(start))
+    shortest = np.asarray(table.distance)[dense.samples + 2 * row, dense.samples + 2 * row + 1]
+    return Pairs(start, goal, shortest, seed)
+
+
+def _join(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    return np.stack([start, goal], 1).reshape(-1, 2)
+
+
+def evaluate(
+    env: MazeEnv,
+    maze: Maze,
+    pairs: Pairs,
+    method: str,
+    *,
+    policy: TransformerPolicy | None = None,
+    controller: Controller | None = None,
+    prm: PrmConfig | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Episodes:
+    """Run one method on all pairs at once.
+
+    Args:
+        env: with maps, without auto-reset.
+        method: "ct" (needs ``policy``), "planner" (the full map, needs ``controller``) or "explorer" (likewise).
+    """
+    begun = time.perf_counter()
+    n = len(pairs.start)
+    key = jax.random.key(pairs.seed)
+    mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
+    state = start_episodes(env, key, mazes, jnp.asarray(pairs.start), jnp.asarray(pairs.goal))
+    asked = None
+    if method == "ct":
+        assert policy is not None
+        actor, memory = policy, policy.init(state)
+        asked = np.asarray(memory.rtg)
+    else:
+        assert controller is not None
+        prm = prm or PrmConfig()
+        guide = make_guide("shortcut" if method == "planner" else method, env, prm)
+        roadmap = build_roadmap(key, maze, radius_m=env.robot.radius_m, config=prm)
+        table = extend(roadmap, _join(pairs.start, pairs.goal)).table
+        tables: PlanTable = jax.tree.map(lambda leaf: leaf[None], table)
+        actor = Guided(controller, guide)
+        memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
+    state, _, steps = run_episodes(env, actor, state, memory, key, chunk=50, limit=env.horizon, on_progress=on_progress)
+    return _outcome(steps, np.asarray(state.info["success"]) > 0, pairs, time.perf_counter() - begun, asked)
+
+
+def _outcome(steps: Steps, success: np.ndarray, pairs: Pairs, wall_s: float, asked: np.ndarray | None) -> Episodes:
+    alive = np.asarray(steps.alive)
+    path = np.asarray(steps.position)
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(0)
+    return Episodes(
+        success=success,
+        collided=(np.asarray(steps.collision) * alive).sum(0) > 0,
+        timeout=~success,
+        steps=alive.sum(0),
+        returns=(np.asarray(steps.reward) * alive).sum(0),
+        travelled_m=moved,
+        path=path,
+        pairs=pairs,
+        wall_s=wall_s,
+        asked=asked,
+    )

@@ -1,0 +1,199 @@
+"""Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-C).
+
+The data lie in memory as arrays; a compiled step draws its own windows from them, recomputes their maps and updates the
+parameters, so the host does nothing but watch. Batches are sharded over the devices of a mesh with one axis, "data".
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from ct_envs.maze import Maze
+from ct_jax.trajectories import Trajectories, Window, sample_windows, select
+from ct_jax.transformer import RETURN_SCALE, ControlTransformer, ModelConfig
+from ct_jax.value import ValueNetwork
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """One supervised training (paper, table II)."""
+
+    updates: int = 75_000
+    batch: int = 64  # pieces of trajectories
+    steps: int = 50  # steps of a piece; with more than K, pieces share their past
+    learning_rate: float = 4e-4
+    weight_decay: float = 1e-3
+    warmup: int = 10_000  # updates of linear warm-up
+    decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
+    clip: float = 1.0  # norm to which gradients are clipped
+    mirror: bool = False  # rotate and reflect pieces at random
+    shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
+
+
+@dataclass(frozen=True)
+class ValueConfig:
+    """The value network's training, and which trajectories it sees (paper, sec. III-C)."""
+
+    fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
+    top: float = 1.0  # only the best share X of the trajectories, by return per metre of straight distance
+    collision_free: bool = False  # only trajectories without a collision
+    width: int = 128
+
+
+@struct.dataclass
+class FitState:
+    """Everything that training needs to go on."""
+
+    params: Any
+    optimizer: Any
+    key: jax.Array
+    update: jax.Array
+
+
+def data_mesh() -> Mesh:
+    """All devices along one axis, "data"."""
+    return jax.make_mesh((jax.device_count(),), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+
+
+Loss = Callable[[Any, Window, jax.Array], jax.Array]
+
+
+class Fit:
+    """A learner by gradient descent on windows of trajectories: ``create`` and ``train``, both pure."""
+
+    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float):
+        self.loss, self.config, self.map_cell_m = loss, config, map_cell_m
+        if config.decay:
+            rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, config.warmup, config.updates)
+        else:
+            rate = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
+        self.optimizer = optax.chain(
+            optax.clip_by_global_norm(config.clip),
+            optax.adamw(rate, weight_decay=config.weight_decay, mask=_matrices),
+        )
+        self._mesh = data_mesh()
+        self.train = jax.jit(self._train, static_argnames="updates", donate_argnums=0)
+
+    def create(self, key: jax.Array, params: Any) -> FitState:
+        """The state before training, replicated over the devices."""
+        state = FitState(params, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
+        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self._mesh, PartitionSpec()))
+
+    def _train(
+        self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze, updates: int
+    ) -> tuple[FitState, jax.Array]:
+        """Run some updates (static); returns the mean loss over them."""
+        shard = NamedSharding(self._mesh, PartitionSpec("data"))
+
+        def update(state: FitState, _) -> tuple[FitState, jax.Array]:
+            draw, drop = jax.random.split(jax.random.fold_in(state.key, state.update))
+            window = sample_windows(
+                draw,
+                data,
+                rtg,
+                mazes,
+                batch=self.config.batch,
+                steps=self.config.steps,
+                map_cell_m=self.map_cell_m,
+                mirror=self.config.mirror,
+                shift_timestep=self.config.shift_timestep,
+            )
+            window = jax.lax.with_sharding_constraint(window, shard)
+            loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)
+            change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
+            params = optax.apply_updates(state.params, change)
+            return FitState(params, optimizer, state.key, state.update + 1), loss
+
+        state, losses = jax.lax.scan(update, state, length=updates)
+        return state, losses.mean()
+
+
+def _matrices(params: Any) -> Any:
+    """Weight decay is for matrices and kernels, not for biases and norms."""
+    return jax.tree.map(lambda leaf: leaf.ndim > 1, params)
+
+
+def transformer_loss(model: ControlTransformer) -> Loss:
+    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-C)."""
+
+    def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
+        predicted = model.apply(
+            params, window.map, window.proprio, window.goal, window.action, window.rtg, window.timestep, window.valid,
+            deterministic=False, rngs={"dropout": key},
+        )  # fmt: skip
+        error = jnp.mean((predicted - window.action) ** 2, -1)  # pyright: ignore
+        return jnp.sum(error * window.learn) / jnp.maximum(jnp.sum(window.learn), 1.0)
+
+    return loss
+
+
+def value_loss(model: ValueNetwork) -> Loss:
+    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-C)."""
+
+    def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
+        del key
+        value = model.apply(params, window.map, window.proprio, window.goal)
+        error = ((value - window.rtg) / RETURN_SCALE) ** 2  # pyright: ignore
+        return jnp.sum(error * window.valid) / jnp.maximum(jnp.sum(window.valid), 1.0)
+
+    return loss
+
+
+def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: Trajectories) -> Any:
+    """Fresh parameters for data of these sizes."""
+    one = jnp.zeros((1, 1))
+    maps, proprio, goal = jnp.zeros((1, 1, 2, 25, 25)), jnp.zeros((1, 1, data.proprio.shape[-1])), jnp.zeros((1, 1, 2))
+    if isinstance(model, ValueNetwork):
+        return jax.jit(model.init)(key, maps, proprio, goal)
+    action = jnp.zeros((1, 1, data.action.shape[-1]))
+    return jax.jit(model.init)(key, maps, proprio, goal, action, one, one.astype(jnp.int32), one)
+
+
+def best_trajectories(data: Trajectories, config: ValueConfig) -> Trajectories:
+    """The trajectories that the value network learns from: whole successes, the top X %, collision-free on demand."""
+    keep = np.ones(data.n, bool)
+    if config.collision_free:
+        keep &= np.asarray(data.collision).sum(1) == 0
+    if config.top < 1.0:
+        straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
+        score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
+        keep &= score >= np.quantile(score[keep], 1.0 - config.top)
+    return select(data, keep)
+
+
+def fit(
+    key: jax.Array,
+    learner: Fit,
+    params: Any,
+    data: Trajectories,
+    mazes: Maze,
+    *,
+    on_progress: Callable[[int, float], None] = lambda update, loss: None,
+    chunk: int = 20,
+) -> Any:
+    """Train to the configured number of updates; returns the parameters.
+
+    Args:
+        on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
+    """
+    state = learner.create(key, params)
+    place = functools.partial(jax.device_put, device=NamedSharding(data_mesh(), PartitionSpec()))
+    data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
+    for done in range(chunk, learner.config.updates + 1, chunk):
+        state, loss = learner.train(state, data, rtg, mazes, chunk)
+        on_progress(done, float(loss))
+    return state.params
+
+
+def make_transformer(config: ModelConfig, action_size: int) -> ControlTransformer:
+    """The transformer of that configuration."""
+    return ControlTransformer(config, action_size)

@@ -1,0 +1,62 @@
+"""Acting with a Control Transformer: return bookkeeping and the key/value cache (paper, sec. III-C)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from flax import struct
+from jaxtyping import Array, Float
+
+from ct_jax.rollout import Action
+from ct_jax.transformer import Cache, ControlTransformer, ModelConfig, empty_cache
+from ct_jax.value import ValueNetwork
+
+
+@struct.dataclass
+class Conditioned:
+    """Memory of N episodes: the cache, and the return-to-go still asked for."""
+
+    cache: Cache
+    rtg: Float[Array, "N"]
+
+
+@struct.dataclass
+class TransformerPolicy:
+    """pi_theta in N environments at once, all of them at the same step of their episodes."""
+
+    params: Any
+    value_params: Any
+    config: ModelConfig = struct.field(pytree_node=False)
+    action_size: int = struct.field(pytree_node=False)
+    value_width: int = struct.field(pytree_node=False, default=128)
+    optimism: float = struct.field(pytree_node=False, default=1.0)  # k: ask for k * V (paper)
+    reprompt: bool = struct.field(pytree_node=False, default=False)  # never ask for more than V of the present state
+
+    @property
+    def model(self) -> ControlTransformer:
+        return ControlTransformer(self.config, self.action_size)
+
+    def init(self, state: State) -> Conditioned:
+        """Ask for the return that the value network predicts from the first observation."""
+        n = state.done.shape[0]
+        return Conditioned(empty_cache(self.config, self.action_size, n), self._value(self, state))
+
+    @staticmethod
+    @jax.jit
+    def _value(policy: "TransformerPolicy", state: State) -> Float[Array, "N"]:
+        obs: dict = state.obs  # pyright: ignore
+        value = ValueNetwork(policy.value_width).apply(policy.value_params, obs["map"], obs["proprio"], obs["goal"])
+        return policy.optimism * value  # pyright: ignore
+
+    def act(self, memory: Conditioned, state: State, key: jax.Array) -> tuple[Action, Conditioned]:
+        """The next actions; the reward just received is taken off the return-to-go."""
+        del key
+        obs: dict = state.obs  # pyright: ignore
+        rtg = memory.rtg - state.reward
+        if self.reprompt:
+            rtg = jnp.minimum(rtg, self._value(self, state))
+        action, cache = self.model.apply(
+            self.params, memory.cache, obs["map"], obs["proprio"], obs["goal"], rtg, method="act"
+        )  # pyright: ignore
+        return Action(action, action), Conditioned(cache, rtg)
