@@ -9,7 +9,7 @@ import numpy as np
 from brax.envs.base import State
 
 from ct_envs import MazeEnv, Tasks, UserError
-from ct_envs.maze import Maze, sample_free
+from ct_envs.maze import Maze, sample_pair
 from ct_jax.explorer import ExplorerGuide
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, stack_tables
 from ct_jax.rollout import Controller, Guided, Steps, rollout
@@ -76,7 +76,7 @@ def _reset(env: MazeEnv) -> Callable:
     return _resets[id(env)][1]
 
 
-def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray, learn: np.ndarray | None = None) -> Trajectories:
+def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Trajectories:
     """Turn the record of N episodes (time first) into trajectories with final goals.
 
     The rewards are relabelled to the final goal (paper, sec. III-B): ``MazeEnv``'s are so from the start, whatever
@@ -88,8 +88,9 @@ def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray, learn: np.
         position=swap(steps.position),
         proprio=swap(steps.proprio),
         action=swap(steps.action),
+        target=swap(steps.target),
         reward=swap(steps.reward),
-        learn=swap(steps.alive if learn is None else learn),
+        learn=swap(steps.learn * steps.alive),
         collision=swap(steps.collision * steps.alive),
         goal=np.asarray(goal),
         maze=np.asarray(maze, np.int32),
@@ -104,7 +105,7 @@ def make_guide(name: str, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | Explor
         return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, prm.connect_m)
     if name not in GUIDES:
         raise UserError(f"no guide named '{name}'; guides: {', '.join(GUIDES)}")
-    return RoadmapGuide(radius + prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")
+    return RoadmapGuide(radius, prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")
 
 
 def collect(
@@ -127,40 +128,54 @@ def collect(
     Raises:
         UserError: too few successes within ``give_up * T`` episodes.
     """
-    n_mazes = mazes.walls.shape[0]
-    guide = make_guide(config.guide, env, prm)
-    policy = Guided(controller, guide, config.noise)
+    policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
     kept: list[Trajectories] = []
-    successes = episodes = batch = 0
+    successes = episodes = 0
     while successes < config.trajectories:
         if episodes >= config.give_up * config.trajectories:
             raise UserError(
                 f"the controller reached only {successes} of {episodes} goals, {config.trajectories} were asked for; "
                 "train it longer or look at its success on edges"
             )
-        run_key, batch_key = jax.random.split(jax.random.fold_in(key, batch))
-        per_maze = max(1, config.envs // config.reset_interval)
-        which = np.arange(config.envs) % per_maze  # roadmap of each environment
-        maze_of = (batch * per_maze + np.arange(per_maze)) % n_mazes
-        starts = [
-            _endpoints(jax.random.fold_in(batch_key, i), jax.tree.map(lambda leaf, m=m: leaf[m], mazes), env, config, prm)
-            for i, m in enumerate(maze_of)
-        ]
-        tables = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[table for table, _, _ in starts])
-        place = np.arange(config.envs) // per_maze
-        start = jnp.stack([starts[w][1][p] for w, p in zip(which, place, strict=True)])
-        goal = jnp.stack([starts[w][2][p] for w, p in zip(which, place, strict=True)])
-        maze = jax.tree.map(lambda leaf: leaf[maze_of[which]], mazes)
-        state = start_episodes(env, run_key, maze, start, goal)
-        memory = policy.init(state, plan_memory(guide, tables, jnp.asarray(which), state))
-        state, _, steps = run_episodes(env, policy, state, memory, run_key, limit=config.horizon)
+        batch_key, run_key = jax.random.split(jax.random.fold_in(key, episodes))
+        batch = draw_batch(batch_key, env, mazes, config, prm, first_maze=episodes // config.reset_interval)
+        memory = policy.init(batch.state, plan_memory(policy.guide, batch.tables, batch.which, batch.state))
+        state, _, steps = run_episodes(env, policy, batch.state, memory, run_key, limit=config.horizon)
         won = np.asarray(state.info["success"]) > 0
-        found = select(to_trajectories(steps, np.asarray(goal), maze_of[which]), won)
-        kept.append(found)
-        successes, episodes, batch = successes + int(won.sum()), episodes + config.envs, batch + 1
+        kept.append(select(to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze), won))
+        successes, episodes = successes + int(won.sum()), episodes + config.envs
         on_progress(successes, episodes)
-    everything = concatenate(kept)
-    return select(everything, np.arange(config.trajectories))
+    return select(concatenate(kept), np.arange(config.trajectories))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """First states of episodes, each with a roadmap that connects its start and goal."""
+
+    state: State
+    tables: PlanTable  # leading axis: roadmaps
+    which: jax.Array  # int32 [N]: roadmap of each episode
+    maze: np.ndarray  # int [N]: maze of each episode
+
+
+def draw_batch(
+    key: jax.Array, env: MazeEnv, mazes: Maze, config: CollectConfig, prm: PrmConfig, *, first_maze: int = 0
+) -> Batch:
+    """Fresh roadmaps, one for every ``reset_interval`` episodes and on one maze after the other, and episodes on them."""
+    n_maps = max(1, config.envs // config.reset_interval)
+    per_map = -(-config.envs // n_maps)
+    maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]
+    keys = jax.random.split(key, n_maps + 1)
+    drawn = [
+        _endpoints(k, jax.tree.map(lambda leaf, m=m: leaf[m], mazes), env, config, prm, per_map)
+        for k, m in zip(keys[:-1], maze_of_map, strict=True)
+    ]
+    tables = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[table for table, _, _ in drawn])
+    start, goal = (jnp.concatenate([each[i] for each in drawn])[: config.envs] for i in (1, 2))
+    which = np.repeat(np.arange(n_maps), per_map)[: config.envs]
+    maze = jax.tree.map(lambda leaf: leaf[maze_of_map[which]], mazes)
+    state = start_episodes(env, keys[-1], maze, start, goal)
+    return Batch(state, tables, jnp.asarray(which), maze_of_map[which])
 
 
 def plan_memory(guide: RoadmapGuide | ExplorerGuide, tables: PlanTable, which: jax.Array, state: State) -> object:
@@ -177,15 +192,14 @@ def _plan(guide: RoadmapGuide, tables: PlanTable, which: jax.Array, maze: Maze, 
 
 
 def _endpoints(
-    key: jax.Array, maze: Maze, env: MazeEnv, config: CollectConfig, prm: PrmConfig
+    key: jax.Array, maze: Maze, env: MazeEnv, config: CollectConfig, prm: PrmConfig, n: int
 ) -> tuple[PlanTable, jax.Array, jax.Array]:
-    """A fresh roadmap, and starts and goals for its share of the environments that it connects."""
-    map_key, pair_key, start_key, goal_key = jax.random.split(key, 4)
+    """A fresh roadmap, and n starts and goals [n, 2] (m) that it connects."""
+    map_key, pair_key = jax.random.split(key)
     roadmap = build_roadmap(map_key, maze, radius_m=env.robot.radius_m, config=prm)
-    per_map = -(-config.envs // max(1, config.envs // config.reset_interval))
     if config.starts == "maze":
-        sample = jax.vmap(lambda k: sample_free(k, maze, radius=env.robot.radius_m)[0])
-        return roadmap.table, sample(jax.random.split(start_key, per_map)), sample(jax.random.split(goal_key, per_map))
+        pairs = jax.vmap(lambda k: sample_pair(k, maze, radius=env.robot.radius_m))(jax.random.split(pair_key, n))
+        return roadmap.table, *pairs
     reachable = np.argwhere(np.isfinite(np.asarray(roadmap.table.distance)) & ~np.eye(prm.samples, dtype=bool))
-    pairs = reachable[np.asarray(jax.random.randint(pair_key, (per_map,), 0, len(reachable)))]
-    return roadmap.table, roadmap.table.points[pairs[:, 0]], roadmap.table.points[pairs[:, 1]]
+    chosen = reachable[np.asarray(jax.random.randint(pair_key, (n,), 0, len(reachable)))]
+    return roadmap.table, roadmap.table.points[chosen[:, 0]], roadmap.table.points[chosen[:, 1]]

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from ct_envs import MazeEnv
-from ct_envs.maze import Maze, sample_free
+from ct_envs.maze import Maze, sample_pair
 from ct_jax.collect import plan_memory, run_episodes, start_episodes, make_guide
 from ct_jax.prm import PlanTable, PrmConfig, Roadmap, build_roadmap, extend
 from ct_jax.policy import TransformerPolicy
@@ -75,13 +75,9 @@ def bootstrap(values: np.ndarray) -> list[float]:
 
 def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: float) -> Pairs:
     """Draw pairs of free points of one region, a goal never within twice the tolerance of its start."""
-
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        a, b = jax.random.split(key)
-        start, region = sample_free(a, maze, radius=radius_m)
-        return start, sample_free(b, maze, radius=radius_m, index=region)[0]
-
-    start, goal = map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(seed), 8 * n + 64)))
+    keys = jax.random.split(jax.random.key(seed), 8 * n + 64)
+    draw = jax.jit(jax.vmap(lambda key: sample_pair(key, maze, radius=radius_m)))
+    start, goal = map(np.asarray, draw(keys))
     apart = np.flatnonzero(np.linalg.norm(start - goal, axis=1) > 2 * tolerance_m)[:n]
     start, goal = start[apart], goal[apart]
     dense = PrmConfig(samples=1000)

@@ -18,8 +18,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from ct_envs.maze import Maze
+from ct_jax.checkpoint import Checkpoints
 from ct_jax.trajectories import Trajectories, Window, sample_windows, select
-from ct_jax.transformer import RETURN_SCALE, ControlTransformer, ModelConfig
+from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
 
@@ -81,7 +82,7 @@ class Fit:
             optax.adamw(rate, weight_decay=config.weight_decay, mask=_matrices),
         )
         self._mesh = data_mesh()
-        self.train = jax.jit(self._train, static_argnames="updates", donate_argnums=0)
+        self.train = jax.jit(self._train, static_argnames="updates")
 
     def create(self, key: jax.Array, params: Any) -> FitState:
         """The state before training, replicated over the devices."""
@@ -130,7 +131,7 @@ def transformer_loss(model: ControlTransformer) -> Loss:
             params, window.map, window.proprio, window.goal, window.action, window.rtg, window.timestep, window.valid,
             deterministic=False, rngs={"dropout": key},
         )  # fmt: skip
-        error = jnp.mean((predicted - window.action) ** 2, -1)  # pyright: ignore
+        error = jnp.mean((predicted - window.target) ** 2, -1)  # pyright: ignore
         return jnp.sum(error * window.learn) / jnp.maximum(jnp.sum(window.learn), 1.0)
 
     return loss
@@ -150,12 +151,8 @@ def value_loss(model: ValueNetwork) -> Loss:
 
 def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: Trajectories) -> Any:
     """Fresh parameters for data of these sizes."""
-    one = jnp.zeros((1, 1))
-    maps, proprio, goal = jnp.zeros((1, 1, 2, 25, 25)), jnp.zeros((1, 1, data.proprio.shape[-1])), jnp.zeros((1, 1, 2))
-    if isinstance(model, ValueNetwork):
-        return jax.jit(model.init)(key, maps, proprio, goal)
-    action = jnp.zeros((1, 1, data.action.shape[-1]))
-    return jax.jit(model.init)(key, maps, proprio, goal, action, one, one.astype(jnp.int32), one)
+    inputs = sample_inputs(data.proprio.shape[-1], data.action.shape[-1])
+    return jax.jit(model.init)(key, *(inputs[:3] if isinstance(model, ValueNetwork) else inputs))
 
 
 def best_trajectories(data: Trajectories, config: ValueConfig) -> Trajectories:
@@ -178,22 +175,31 @@ def fit(
     mazes: Maze,
     *,
     on_progress: Callable[[int, float], None] = lambda update, loss: None,
+    checkpoints: Checkpoints | None = None,
     chunk: int = 20,
 ) -> Any:
     """Train to the configured number of updates; returns the parameters.
 
     Args:
         on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
+        checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, params)
+    if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
+        state = found[1]
     place = functools.partial(jax.device_put, device=NamedSharding(data_mesh(), PartitionSpec()))
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
-    for done in range(chunk, learner.config.updates + 1, chunk):
-        state, loss = learner.train(state, data, rtg, mazes, chunk)
-        on_progress(done, float(loss))
+    done = int(state.update)
+    try:
+        while done < learner.config.updates:
+            state, loss = learner.train(state, data, rtg, mazes, min(chunk, learner.config.updates - done))
+            done = int(state.update)
+            on_progress(done, float(loss))
+            if checkpoints is not None:
+                checkpoints.maybe_save(done, state)
+    except KeyboardInterrupt:
+        if checkpoints is not None:
+            checkpoints.save(done, state)
+        raise
     return state.params
 
-
-def make_transformer(config: ModelConfig, action_size: int) -> ControlTransformer:
-    """The transformer of that configuration."""
-    return ControlTransformer(config, action_size)

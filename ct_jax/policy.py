@@ -8,7 +8,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from ct_jax.rollout import Action
+from ct_jax.rollout import Action, act_as_meant
 from ct_jax.transformer import Cache, ControlTransformer, ModelConfig, empty_cache
 from ct_jax.value import ValueNetwork
 
@@ -59,4 +59,4 @@ class TransformerPolicy:
         action, cache = self.model.apply(
             self.params, memory.cache, obs["map"], obs["proprio"], obs["goal"], rtg, method="act"
         )  # pyright: ignore
-        return Action(action, action), Conditioned(cache, rtg)
+        return act_as_meant(action), Conditioned(cache, rtg)

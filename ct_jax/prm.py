@@ -206,7 +206,8 @@ class RoadmapGuide:
     step, the point in sight that makes the shortest way to the goal: smoother, and it recovers from any disturbance.
     """
 
-    radius_m: float  # kept clear on the way to a waypoint, where its ends have the room [m]
+    radius_m: float  # of the robot
+    margin_m: float = 0.0  # clearance beyond the radius on the way to a new waypoint, where its ends have the room [m]
     look_m: float = 10.0  # farthest waypoint that is chosen anew [m]
     cell_m: float = 4.0
     waypoint_tolerance_m: float = 0.5
@@ -217,7 +218,7 @@ class RoadmapGuide:
     ) -> Following:
         """Connect starts and goals [N, 2] (m) to their roadmaps ``which``; ``maze`` has a leading axis N."""
         points = tables.points[which]
-        goal_node = jax.vmap(self._nearest_in_sight)(points, maze, goal)
+        goal_node = self._nearest_in_sight(points, maze, goal)
         plan = Following(
             points=points,
             next_hop=tables.next_hop[which, :, goal_node].astype(jnp.int32),
@@ -225,45 +226,55 @@ class RoadmapGuide:
             waypoint=goal_node,
             goal_node=goal_node,
         )
-        return plan.replace(waypoint=self._choose(plan, maze, position))
+        return plan.replace(waypoint=self._choose(plan, maze, position)[0])
 
     def waypoint(
         self, plan: Following, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]
     ) -> tuple[Float[Array, "N 2"], Following]:
         """Targets [N, 2] (m), and the plans with reached waypoints passed and lost ones chosen anew."""
-        if self.shortcut:
-            plan = plan.replace(waypoint=self._choose(plan, maze, position))
         row = jnp.arange(len(plan.waypoint))
-        at = plan.points[row, plan.waypoint]
-        reached = jnp.linalg.norm(at - position, axis=-1) < self.waypoint_tolerance_m
+        away = jnp.linalg.norm(plan.points[row, plan.waypoint] - position, axis=-1)
         hop = plan.next_hop[row, plan.waypoint]
-        waypoint = jnp.where(reached & (hop != NO_HOP), hop, plan.waypoint)
-        lost = ~jax.vmap(self._sees)(maze, position, plan.points[row, waypoint][:, None])[:, 0]
-        waypoint = jax.lax.cond(
-            jnp.any(lost),
-            lambda: jnp.where(lost, self._choose(plan, maze, position), waypoint),
-            lambda: waypoint,
-        )
-        plan = plan.replace(waypoint=waypoint)
-        last = (waypoint == plan.goal_node) & jax.vmap(self._sees)(maze, position, goal[:, None])[:, 0]
-        return jnp.where(last[:, None], goal, plan.points[row, waypoint]), plan
+        waypoint = jnp.where((away < self.waypoint_tolerance_m) & (hop != NO_HOP), hop, plan.waypoint)
+        kept = plan.points[row, waypoint]
+        # A waypoint is chosen with the margin and kept without it: else a robot beside its path would turn back.
+        kept_seen = self._sees(maze, position, kept[:, None], self._keep_m)[:, 0]
+        way = jnp.where(kept_seen, jnp.linalg.norm(kept - position, axis=-1) + plan.to_go[row, waypoint], jnp.inf)
+        better = jnp.inf if not self.shortcut else 1e-3
 
-    def _choose(self, plan: Following, maze: Maze, position: jax.Array) -> Int[Array, "N"]:
-        """The point in sight that makes the shortest way to the goal; the nearest point where none is in sight."""
+        def choose() -> jax.Array:
+            new, new_way = self._choose(plan, maze, position)
+            return jnp.where(~kept_seen | (new_way < way - better), new, waypoint)
+
+        waypoint = choose() if self.shortcut else jax.lax.cond(jnp.all(kept_seen), lambda: waypoint, choose)
+        last = (waypoint == plan.goal_node) & self._sees(maze, position, goal[:, None], self._keep_m)[:, 0]
+        target = jnp.where(last[:, None], goal, plan.points[row, waypoint])
+        return target, plan.replace(waypoint=waypoint)
+
+    @property
+    def _keep_m(self) -> float:
+        return 0.8 * self.radius_m
+
+    def _choose(self, plan: Following, maze: Maze, position: jax.Array) -> tuple[Int[Array, "N"], Float[Array, "N"]]:
+        """The point in sight that makes the shortest way to the goal, and that way [m].
+
+        Where none is in sight, the nearest point, and infinity.
+        """
         away = jnp.linalg.norm(plan.points - position[:, None], axis=-1)
         _, near = jax.lax.top_k(-away, min(_CANDIDATES, away.shape[1]))
         pick = lambda leaf: jnp.take_along_axis(leaf, near, 1)  # noqa: E731
         points = jnp.take_along_axis(plan.points, near[..., None], 1)
-        free = jax.vmap(self._sees)(maze, position, points)
-        way = jnp.where(free & (pick(away) <= self.look_m), pick(away) + pick(plan.to_go), jnp.inf)
-        best = jnp.where(jnp.isfinite(way).any(-1), jnp.argmin(way, -1), 0)
-        return jnp.take_along_axis(near, best[:, None], 1)[:, 0]
+        free = self._sees(maze, position, points, self.radius_m + self.margin_m) & (pick(away) <= self.look_m)
+        way = jnp.where(free, pick(away) + pick(plan.to_go), jnp.inf)
+        best = jnp.argmin(way, -1)[:, None]  # all infinite: the first, which is the nearest
+        return jnp.take_along_axis(near, best, 1)[:, 0], jnp.take_along_axis(way, best, 1)[:, 0]
 
-    def _nearest_in_sight(self, points: jax.Array, maze: Maze, goal: jax.Array) -> jax.Array:
-        away = jnp.linalg.norm(points - goal[None], axis=-1)
-        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points), 0.0, 1e6))
+    def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: Float[Array, "N 2"]) -> Int[Array, "N"]:
+        away = jnp.linalg.norm(points - goal[:, None], axis=-1)
+        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6), -1)
 
-    def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "n 2"]) -> jax.Array:
-        reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
-        free = jax.vmap(lambda p: in_sight(maze, position, p, radius=self.radius_m, reach=reach))(points)
-        return free & (jnp.linalg.norm(points - position, axis=-1) <= 1.5 * self.look_m)
+    def _sees(self, maze: Maze, position: Float[Array, "N 2"], points: Float[Array, "N n 2"], radius: float) -> jax.Array:
+        reach = segment_reach(self.look_m, self.radius_m + self.margin_m, self.cell_m)
+        sight = functools.partial(in_sight, radius=radius, reach=reach)
+        free = jax.vmap(jax.vmap(sight, (None, None, 0)))(maze, position, points)
+        return free & (jnp.linalg.norm(points - position[:, None], axis=-1) <= 1.5 * self.look_m)

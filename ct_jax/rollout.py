@@ -14,10 +14,17 @@ from ct_envs.maze import Maze
 
 
 class Action(NamedTuple):
-    """What a policy meant to do, and what is done: they differ where a disturbance is added on purpose."""
+    """What a policy meant to do, what is done (they differ by a disturbance), and what should be imitated."""
 
     meant: Float[Array, "N A"]
     done: Float[Array, "N A"]
+    target: Float[Array, "N A"]
+    learn: Float[Array, "N"]  # 1 where the target is to be imitated, else 0
+
+
+def act_as_meant(action: Float[Array, "N A"]) -> Action:
+    """An action without disturbance, itself to be imitated."""
+    return Action(action, action, action, jnp.ones(action.shape[:1]))
 
 
 class Policy(Protocol):
@@ -35,7 +42,9 @@ class Steps:
     position: Float[Array, "T N 2"]
     proprio: Float[Array, "T N P"]
     action: Float[Array, "T N A"]  # as meant
+    target: Float[Array, "T N A"]  # to be imitated
     reward: Float[Array, "T N"]
+    learn: Float[Array, "T N"]  # 1 where the action is to be imitated
     alive: Float[Array, "T N"]  # 1 where the episode was still running before the action
     success: Float[Array, "T N"]
     collision: Float[Array, "T N"]
@@ -56,7 +65,9 @@ def rollout(
             position=state.info["position"],
             proprio=state.obs["proprio"],  # pyright: ignore[reportArgumentType]
             action=action.meant,
+            target=action.target,
             reward=after.reward,
+            learn=action.learn,
             alive=1.0 - state.done,
             success=after.info["success"],
             collision=after.info["collision"],
@@ -108,8 +119,8 @@ class Guided:
         guide_memory, disturbance = memory
         action, guide_memory = self.intend(guide_memory, state)
         if not self.noise:
-            return Action(action, action), (guide_memory, disturbance)
+            return act_as_meant(action), (guide_memory, disturbance)
         keep_key, new_key = jax.random.split(key)
         keep = jax.random.bernoulli(keep_key, self.hold, disturbance.shape[:1])[:, None]
         disturbance = jnp.where(keep, disturbance, self.noise * jax.random.normal(new_key, disturbance.shape))
-        return Action(action, action + disturbance), (guide_memory, disturbance)
+        return act_as_meant(action)._replace(done=action + disturbance), (guide_memory, disturbance)

@@ -25,9 +25,10 @@ class Trajectories:
 
     position: Float[Array, "N T 2"]  # before the action [m]
     proprio: Float[Array, "N T P"]
-    action: Float[Array, "N T A"]
+    action: Float[Array, "N T A"]  # as meant: a later step's past
+    target: Float[Array, "N T A"]  # to be imitated; the action itself, unless somebody knew better
     reward: Float[Array, "N T"]  # after the action
-    learn: Float[Array, "N T"]  # 1 where the action is to be imitated
+    learn: Float[Array, "N T"]  # 1 where the target is to be imitated
     collision: Float[Array, "N T"]
     goal: Float[Array, "N 2"]  # final goal [m]
     maze: Int[Array, "N"]  # index into the mazes
@@ -97,10 +98,11 @@ class Window:
     proprio: Float[Array, "B S P"]
     goal: Float[Array, "B S 2"]  # from the robot to the final goal [m]
     action: Float[Array, "B S A"]
+    target: Float[Array, "B S A"]
     rtg: Float[Array, "B S"]
     timestep: Int[Array, "B S"]
     valid: Float[Array, "B S"]  # 1 where there is a step
-    learn: Float[Array, "B S"]  # 1 where the action is to be imitated
+    learn: Float[Array, "B S"]  # 1 where the target is to be imitated
 
 
 def sample_windows(
@@ -142,6 +144,7 @@ def sample_windows(
         proprio=take(trajectories.proprio),
         goal=goal[:, None] - position,
         action=take(trajectories.action),
+        target=take(trajectories.target),
         rtg=take(rtg),
         timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1),
         valid=valid.astype(jnp.float32),
@@ -174,4 +177,5 @@ def mirror_windows(symmetry: Int[Array, "B"], window: Window) -> Window:
         proprio=vectors(window.proprio),
         goal=vectors(window.goal),
         action=vectors(window.action),
+        target=vectors(window.target),
     )

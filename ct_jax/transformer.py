@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from ct_envs.occupancy import MAP_CELLS
+
 TOKENS = 3  # of a step: return-to-go, state, action
 GOAL_SCALE_M = 10.0  # goal vectors are divided by this
 RETURN_SCALE = 1000.0  # returns are divided by this
@@ -63,6 +65,12 @@ class MapEncoder(nn.Module):
         rows = [x[..., i : n - 2 + i, j : n - 2 + j, :] for i in range(3) for j in range(3)]
         x = nn.relu(nn.Dense(64, name="conv3")(jnp.concatenate(rows, -1)))
         return nn.Dense(self.width, name="out")(x.reshape(*lead, -1))
+
+
+def goal_features(goal: Float[Array, "*b 2"]) -> Float[Array, "*b 6"]:
+    """The vector to the goal [m] far off, close by, and as a direction: half a metre matters at the end of forty."""
+    distance = jnp.linalg.norm(goal, axis=-1, keepdims=True)
+    return jnp.concatenate([goal / GOAL_SCALE_M, jnp.tanh(goal / 2.0), goal / (distance + 0.1)], -1)
 
 
 class Block(nn.Module):
@@ -121,7 +129,7 @@ class ControlTransformer(nn.Module):
 
     def _embed_state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:
         """Map, proprioception and goal joined into one embedding."""
-        goal = self.embed_goal(goal / GOAL_SCALE_M)
+        goal = self.embed_goal(goal_features(goal))
         return self.embed_state(jnp.concatenate([self.encode_map(maps), proprio, goal], -1))
 
     def __call__(
@@ -200,3 +208,11 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
         now=jnp.zeros((), jnp.int32),
         action=jnp.zeros((n, action_size)),
     )
+
+
+def sample_inputs(proprio_size: int, action_size: int) -> tuple[jax.Array, ...]:
+    """Inputs of one step, from which parameters are initialised."""
+    one = jnp.zeros((1, 1))
+    maps = jnp.zeros((1, 1, 2, MAP_CELLS, MAP_CELLS))
+    proprio, goal, action = (jnp.zeros((1, 1, size)) for size in (proprio_size, 2, action_size))
+    return maps, proprio, goal, action, one, jnp.zeros((1, 1), jnp.int32), one

@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder
+from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder, goal_features
 
 
 class ValueNetwork(nn.Module):
@@ -18,7 +18,7 @@ class ValueNetwork(nn.Module):
     ) -> Float[Array, "*b"]:
         """Expected return [m], at most 0."""
         distance = jnp.linalg.norm(goal, axis=-1, keepdims=True)
-        x = jnp.concatenate([MapEncoder(self.width)(maps), proprio, goal / GOAL_SCALE_M, distance / GOAL_SCALE_M], -1)
+        x = jnp.concatenate([MapEncoder(self.width)(maps), proprio, goal_features(goal), distance / GOAL_SCALE_M], -1)
         for _ in range(2):
             x = nn.relu(nn.Dense(self.width)(x))
         return -RETURN_SCALE * nn.softplus(nn.Dense(1)(x)[..., 0])

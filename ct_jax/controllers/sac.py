@@ -25,8 +25,9 @@ from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze
+from ct_jax.checkpoint import Checkpoints
 from ct_jax.prm import Roadmap
-from ct_jax.rollout import Action, Controller, rollout
+from ct_jax.rollout import Action, Controller, act_as_meant, rollout
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,9 @@ def _observe(state: State) -> jax.Array:
     return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
 
 
-def _networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
-    return sac_networks.make_sac_networks(
+def controller_networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
+    """Policy and critics for a controller of these sizes."""
+    return sac_networks.make_saccontroller_networks(
         observation_size,
         action_size,
         preprocess_observations_fn=running_statistics.normalize,
@@ -91,7 +93,7 @@ class SacController:
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
 
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
-        networks = _networks(proprio.shape[-1] + 2, self.action_size, self.hidden)
+        networks = controller_networks(proprio.shape[-1] + 2, self.action_size, self.hidden)
         logits = networks.policy_network.apply(self.normalizer, self.policy, jnp.concatenate([proprio, goal], -1))
         return networks.parametric_action_distribution.mode(logits)
 
@@ -124,7 +126,7 @@ class Sac:
             env: with auto-reset and without maps; its robot says which reward is used.
         """
         self.env, self.config = env, config
-        self.networks = _networks(env.proprio_size + 2, env.action_size, config.hidden)
+        self.networks = controller_networks(env.proprio_size + 2, env.action_size, config.hidden)
         self._optimizer = optax.adam(config.learning_rate)
         alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
             self.networks, reward_scaling=1.0, discounting=config.discount, action_size=env.action_size
@@ -259,7 +261,7 @@ class Steered:
 
     def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
         action = self.controller(state.obs["proprio"], state.obs["goal"])  # pyright: ignore
-        return Action(action, action), memory
+        return act_as_meant(action), memory
 
 
 def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
@@ -279,13 +281,15 @@ def train_controller(
     config: SacConfig,
     *,
     on_progress: Callable[[int, dict[str, float]], None] = lambda iteration, metrics: None,
-    chunk: int = 50,
+    checkpoints: Checkpoints | None = None,
+    chunk: int = 25,
 ) -> tuple[SacController, float]:
     """Algorithm 2: learn pi_c on the roadmap's edges.
 
     Args:
         env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
         on_progress: told (iterations done, metrics) after every ``chunk`` iterations.
+        checkpoints: where to go on from, and where to save now and then and when interrupted.
 
     Returns:
         The controller, and its success on held-out edges.
@@ -296,9 +300,20 @@ def train_controller(
     env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
     sac = Sac(env, config)
     state = sac.create(train_key, maze, train_tasks)
-    for done in range(chunk, config.iterations + 1, chunk):
-        state, metrics = sac.train(state, chunk)
-        on_progress(done, {name: float(value) for name, value in metrics.items()})
+    if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
+        state = found[1]
+    done = int(state.iteration)
+    try:
+        while done < config.iterations:
+            state, metrics = sac.train(state, min(chunk, config.iterations - done))
+            done = int(state.iteration)
+            on_progress(done, {name: float(value) for name, value in metrics.items()})
+            if checkpoints is not None:
+                checkpoints.maybe_save(done, state)
+    except KeyboardInterrupt:
+        if checkpoints is not None:
+            checkpoints.save(done, state)
+        raise
     act = SacController(state.normalizer, state.policy, env.action_size, config.hidden)
     test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
     return act, edge_success(test_env, act, maze, test_tasks, test_key)

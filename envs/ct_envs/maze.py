@@ -331,3 +331,10 @@ def sample_free(
     slack = maze.cell_m / 2 - radius - 1e-3
     offset = jax.random.uniform(place, (2,), minval=-1.0, maxval=1.0) * slack
     return cell_centre(maze, maze.free_cells[chosen]) + offset, chosen
+
+
+def sample_pair(key: jax.Array, maze: Maze, *, radius: float) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """A random start and a random goal of the same region, both with clearance ``radius`` [m]."""
+    start_key, goal_key = jax.random.split(key)
+    start, index = sample_free(start_key, maze, radius=radius)
+    return start, sample_free(goal_key, maze, radius=radius, index=index)[0]

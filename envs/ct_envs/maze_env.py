@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from ct_envs.errors import UserError
-from ct_envs.maze import CELL_M, Maze, clearance, sample_free
+from ct_envs.maze import CELL_M, Maze, clearance, sample_pair
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_envs.physics import PhysicsState, make_engine, nearest_walls
 from ct_envs.robots import Robot, get_robot
@@ -116,10 +116,7 @@ class MazeEnv(Env):
         if tasks is not None:
             i = jax.random.randint(key, (), 0, tasks.n)
             return tasks.start[i], tasks.goal[i]
-        start_key, goal_key = jax.random.split(key)
-        start, region = sample_free(start_key, maze, radius=self.robot.radius_m)
-        goal, _ = sample_free(goal_key, maze, radius=self.robot.radius_m, index=region)
-        return start, goal
+        return sample_pair(key, maze, radius=self.robot.radius_m)
 
     def _initial_physics(self, key: jax.Array, start: jax.Array) -> PhysicsState:
         model = self.engine.model

@@ -96,10 +96,15 @@ def nearest_walls(maze: Maze, position: Float[Array, "2"]) -> Float[Array, "WALL
     return jnp.concatenate([centre, height[:, None]], -1)
 
 
-def make_engine(name: str, robot: Robot, *, cell_m: float = CELL_M) -> Engine:
-    """The engine of that name; "auto" is "mujoco" on CPU and "mjx" on accelerators. Raises UserError."""
+def check_engine(name: str) -> None:
+    """Raise UserError, with the valid names, if there is no such engine."""
     if name not in ENGINES:
         raise UserError(f"no engine named '{name}'; engines: {', '.join(ENGINES)}")
+
+
+def make_engine(name: str, robot: Robot, *, cell_m: float = CELL_M) -> Engine:
+    """The engine of that name; "auto" is "mujoco" on CPU and "mjx" on accelerators. Raises UserError."""
+    check_engine(name)
     if name == "auto":
         name = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     model = build_model(robot, cell_m=cell_m)

@@ -1,0 +1,145 @@
+"""Planning-guided fine-tuning: the policy's failures, and the planner's way out of them (paper, Algorithm 4)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from ct_envs import MazeEnv, UserError
+from ct_envs.maze import Maze
+from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes, to_trajectories
+from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PrmConfig
+from ct_jax.rollout import Action, Controller, Guided
+from ct_jax.trajectories import Trajectories, concatenate, select
+
+KEEP = ("separate", "joined", "relabelled")
+
+
+@dataclass(frozen=True)
+class RecoverConfig:
+    """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's where it gives any."""
+
+    recoveries: int = 500  # T
+    stuck_steps: int = 40  # failure: in so many steps ...
+    stuck_m: float = 4.0  # ... the robot moved less than this [m]
+    patience: int = 200  # failure: not at the goal after so many steps
+    takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
+    keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
+    # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
+    give_up: float = 20.0  # stop after this many times T episodes
+
+
+@struct.dataclass
+class Watching:
+    """Memory of a policy under supervision."""
+
+    own: Any
+    guided: Any
+    past: Float[Array, "W N 2"]  # positions of the last steps [m]
+    steps: Int[Array, ""]
+    rescued: Bool[Array, "N"]
+
+
+@struct.dataclass
+class Supervised:
+    """The transformer until f(s) says that it failed; from then on the controller led by the planner."""
+
+    own: TransformerPolicy
+    guided: Guided
+    config: RecoverConfig = struct.field(pytree_node=False)
+
+    def init(self, state: State, own: Any, guided: Any) -> Watching:
+        n = state.done.shape[0]
+        past = jnp.full((self.config.stuck_steps, n, 2), jnp.inf)
+        return Watching(own, guided, past, jnp.zeros((), jnp.int32), jnp.zeros(n, bool))
+
+    def act(self, memory: Watching, state: State, key: jax.Array) -> tuple[Action, Watching]:
+        own_key, guided_key, chance_key = jax.random.split(key, 3)
+        own, own_memory = self.own.act(memory.own, state, own_key)
+        guided, guided_memory = self.guided.act(memory.guided, state, guided_key)
+        position = state.info["position"]
+        rescued = memory.rescued | self._failed(memory, position)
+        rescued |= jax.random.bernoulli(chance_key, self.config.takeover, rescued.shape)
+        action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
+        if self.config.keep == "relabelled":
+            action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape))
+        else:
+            action = action._replace(learn=rescued.astype(jnp.float32))
+        past = jnp.concatenate([memory.past[1:], position[None]])
+        return action, Watching(own_memory, guided_memory, past, memory.steps + 1, rescued)
+
+    def _failed(self, memory: Watching, position: jax.Array) -> Bool[Array, "N"]:
+        """f(s): stuck in a place, or out of patience."""
+        stuck = jnp.linalg.norm(position - memory.past[0], axis=-1) < self.config.stuck_m
+        return stuck | (memory.steps >= self.config.patience)
+
+
+def recover(
+    key: jax.Array,
+    env: MazeEnv,
+    mazes: Maze,
+    policy: TransformerPolicy,
+    controller: Controller,
+    config: RecoverConfig,
+    collecting: CollectConfig,
+    prm: PrmConfig,
+    *,
+    on_progress: Callable[[int, int], None] = lambda recoveries, episodes: None,
+) -> Trajectories:
+    """Algorithm 4: failures of the policy and the planner's recoveries from them.
+
+    Args:
+        env: with maps, without auto-reset; its horizon bounds failure and recovery together.
+        collecting: whose starts, guide, reset interval and number of environments are used.
+
+    Returns:
+        With ``keep="separate"`` two trajectories for each recovery, otherwise one.
+
+    Raises:
+        UserError: too few recoveries within ``give_up * T`` episodes.
+    """
+    guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
+    supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
+    kept: list[Trajectories] = []
+    recoveries = episodes = 0
+    while recoveries < config.recoveries:
+        if episodes >= config.give_up * config.recoveries:
+            break
+        batch_key, run_key = jax.random.split(jax.random.fold_in(key, episodes))
+        first = episodes // collecting.reset_interval
+        batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first)
+        plan = plan_memory(guide, batch.tables, batch.which, batch.state)
+        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
+        state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
+        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
+        rescued = np.asarray(state.info["success"]) > 0
+        if config.keep != "relabelled":  # there, the transformer's own successes are told what is better, too
+            rescued &= data.learn.sum(1) > 0
+        kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
+        recoveries, episodes = recoveries + int(rescued.sum()), episodes + collecting.envs
+        on_progress(recoveries, episodes)
+    if not recoveries:
+        raise UserError(f"no recovery in {episodes} episodes; the policy hardly fails, so skip fine-tuning")
+    return concatenate(kept)
+
+
+def _split(data: Trajectories) -> list[Trajectories]:
+    """Each trajectory as two: up to the failure, and the recovery from it."""
+    learn = np.asarray(data.learn)
+    begin = learn.argmax(1)
+    fail = data.replace(length=begin.astype(np.int32), learn=(np.arange(learn.shape[1]) < begin[:, None]) * 1.0)
+    later = np.minimum(np.arange(learn.shape[1]) + begin[:, None], learn.shape[1] - 1)
+    row = np.arange(data.n)[:, None]
+    moved = {name: np.asarray(getattr(data, name))[row, later] for name in _PER_STEP}
+    recovery = replace(data, **moved, length=np.asarray(data.length) - begin)
+    return [select(fail, begin > 0), recovery]
+
+
+_PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")

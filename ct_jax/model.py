@@ -1,0 +1,123 @@
+"""A trained model as it is shipped: transformer, value network and controller in one folder, without pickle.
+
+``weights.safetensors`` holds the arrays, ``model.json`` the robot, the settings and where they came from.
+"""
+
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics, specs
+
+from ct_envs import MazeEnv, UserError
+from ct_envs.robots import get_robot
+from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.controllers.sac import SacController, controller_networks
+from ct_jax.policy import TransformerPolicy
+from ct_jax.presets import Settings, from_dict, to_dict
+from ct_jax.transformer import ControlTransformer, sample_inputs
+from ct_jax.value import ValueNetwork
+
+ZOO = "zoo:"
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """What a run makes and an evaluation needs."""
+
+    robot: str
+    settings: Settings
+    policy: TransformerPolicy
+    controller: SacController
+    made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
+
+
+def save_model(folder: Path, model: TrainedModel) -> None:
+    """Write a model into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller))
+    write_json(
+        folder / "model.json",
+        {"format": 1, "robot": model.robot, "settings": to_dict(model.settings), "made": model.made},
+    )
+
+
+def zoo_names() -> list[str]:
+    """Names of the models that ship with the package."""
+    root = resources.files("ct_jax") / "zoo"
+    return sorted(p.name for p in root.iterdir() if (p / "model.json").is_file()) if root.is_dir() else []
+
+
+def model_folder(run: str) -> Path:
+    """Where the model of a run folder, a model folder or a ``zoo:NAME`` lies. Raises UserError."""
+    if run.startswith(ZOO):
+        name = run.removeprefix(ZOO)
+        if name not in zoo_names():
+            names = ", ".join(ZOO + each for each in zoo_names()) or "none"
+            raise UserError(f"no model '{run}' in the zoo; models: {names}")
+        return Path(str(resources.files("ct_jax") / "zoo" / name))
+    for folder in (Path(run) / "model", Path(run)):
+        if (folder / "model.json").is_file():
+            return folder
+    if (Path(run) / "config.json").is_file():
+        raise UserError(f"{run}: not trained to the end yet; continue it with: ct-jax train ... --out {run} --resume")
+    raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or zoo:NAME")
+
+
+def load_model(run: str) -> TrainedModel:
+    """Read the model of a run folder, a model folder or a ``zoo:NAME``.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    folder = model_folder(run)
+    meta = read_json(folder / "model.json")
+    try:
+        robot, values, made = meta["robot"], meta["settings"], meta.get("made", {})
+    except (KeyError, TypeError, AttributeError):
+        raise UserError(f"{folder / 'model.json'}: not a model's description; train again") from None
+    settings = from_dict(values)
+    policy, controller = blank_model(robot, settings)
+    like = jax.eval_shape(lambda: _arrays(policy, controller))
+    arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like))
+    policy = policy.replace(params=arrays["transformer"], value_params=arrays["value"])
+    controller = controller.replace(normalizer=arrays["normalizer"], policy=arrays["controller"])
+    return TrainedModel(robot, settings, policy, controller, made)
+
+
+def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController]:
+    """An untrained policy and controller of the right sizes, for their structure."""
+    env = MazeEnv(get_robot(robot), engine="mujoco")
+    key = jax.random.key(0)
+    maps, proprio, goal, *rest = sample_inputs(env.proprio_size, env.action_size)
+    transformer = ControlTransformer(settings.model, env.action_size)
+    value = ValueNetwork(settings.value.width)
+    size = env.proprio_size + 2
+    policy = TransformerPolicy(
+        params=jax.jit(transformer.init)(key, maps, proprio, goal, *rest),
+        value_params=jax.jit(value.init)(key, maps, proprio, goal),
+        config=settings.model,
+        action_size=env.action_size,
+        value_width=settings.value.width,
+        optimism=settings.optimism,
+        reprompt=settings.reprompt,
+    )
+    controller = SacController(
+        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
+        policy=controller_networks(size, env.action_size, settings.sac.hidden).policy_network.init(key),
+        action_size=env.action_size,
+        hidden=settings.sac.hidden,
+    )
+    return policy, controller
+
+
+def _arrays(policy: TransformerPolicy, controller: SacController) -> dict[str, Any]:
+    return {
+        "transformer": policy.params,
+        "value": policy.value_params,
+        "normalizer": controller.normalizer,
+        "controller": controller.policy,
+    }

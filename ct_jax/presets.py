@@ -1,0 +1,70 @@
+"""All settings of a run, and the presets: instances of them."""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from ct_envs import UserError
+from ct_jax.collect import CollectConfig
+from ct_jax.controllers.sac import SacConfig
+from ct_jax.finetune import RecoverConfig
+from ct_jax.fit import FitConfig, ValueConfig
+from ct_jax.prm import PrmConfig
+from ct_jax.transformer import ModelConfig
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything a run depends on besides its robot, mazes, engine and seed."""
+
+    prm: PrmConfig = PrmConfig()
+    sac: SacConfig = SacConfig()
+    collect: CollectConfig = CollectConfig()
+    model: ModelConfig = ModelConfig()
+    value: ValueConfig = ValueConfig()
+    fit: FitConfig = FitConfig()
+    recover: RecoverConfig = RecoverConfig()
+    rounds: int = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
+    round_fit: FitConfig | None = None  # the training in each round; by default as ``fit``
+    optimism: float = 1.0  # k: ask for k * V (paper, sec. III-C)
+    reprompt: bool = False  # never ask for more than V of the present state
+    episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
+
+
+PAPER = Settings(
+    model=ModelConfig(layers=4, heads=4, width=512, context=50, context_acting=200),
+    fit=FitConfig(updates=75_000, batch=64, steps=50, learning_rate=4e-4, weight_decay=1e-3, warmup=10_000),
+)
+"""The method as published, table II; wants a GPU."""
+
+PRESETS = {"paper": PAPER}
+
+
+def get_preset(name: str) -> Settings:
+    """The preset of that name. Raises UserError with the valid names."""
+    if name not in PRESETS:
+        raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(PRESETS))}")
+    return PRESETS[name]
+
+
+def to_dict(settings: Settings) -> dict[str, Any]:
+    """The settings as JSON holds them."""
+    return asdict(settings)
+
+
+def from_dict(values: dict[str, Any]) -> Settings:
+    """The settings that ``to_dict`` gave. Raises UserError if they are of another version."""
+    try:
+        value = values["value"] | {"fit": FitConfig(**values["value"]["fit"])}
+        return replace(
+            Settings(**{k: v for k, v in values.items() if not isinstance(v, dict)}),
+            prm=PrmConfig(**values["prm"]),
+            sac=SacConfig(**values["sac"] | {"hidden": tuple(values["sac"]["hidden"])}),
+            collect=CollectConfig(**values["collect"]),
+            model=ModelConfig(**values["model"]),
+            value=ValueConfig(**value),
+            fit=FitConfig(**values["fit"]),
+            recover=RecoverConfig(**values["recover"]),
+            round_fit=FitConfig(**values["round_fit"]) if values["round_fit"] else None,
+        )
+    except (KeyError, TypeError, AttributeError) as bad:
+        raise UserError(f"settings of another version ({bad}); train again") from None
