@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints
-from ct_jax.trajectories import Trajectories, Window, sample_windows, select
+from ct_jax.trajectories import Trajectories, Window, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -187,6 +187,8 @@ def fit(
     state = learner.create(key, params)
     if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
         state = found[1]
+    # A dataset that grows from round to round compiles anew only when it outgrows these.
+    data = pad(data, -(-data.n // 1024) * 1024, -(-data.position.shape[1] // 256) * 256)
     place = functools.partial(jax.device_put, device=NamedSharding(data_mesh(), PartitionSpec()))
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
     done = int(state.update)

@@ -38,6 +38,7 @@ class TrainedModel:
 def save_model(folder: Path, model: TrainedModel) -> None:
     """Write a model into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "model.json").unlink(missing_ok=True)  # written last: it says that the weights are whole
     save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller))
     write_json(
         folder / "model.json",
@@ -51,20 +52,23 @@ def zoo_names() -> list[str]:
     return sorted(p.name for p in root.iterdir() if (p / "model.json").is_file()) if root.is_dir() else []
 
 
+def _zoo_words() -> str:
+    return ", ".join(ZOO + name for name in zoo_names()) or "zoo:NAME (none ships with this version)"
+
+
 def model_folder(run: str) -> Path:
     """Where the model of a run folder, a model folder or a ``zoo:NAME`` lies. Raises UserError."""
     if run.startswith(ZOO):
         name = run.removeprefix(ZOO)
         if name not in zoo_names():
-            names = ", ".join(ZOO + each for each in zoo_names()) or "none"
-            raise UserError(f"no model '{run}' in the zoo; models: {names}")
+            raise UserError(f"no model '{run}' in the zoo; models: {_zoo_words()}")
         return Path(str(resources.files("ct_jax") / "zoo" / name))
     for folder in (Path(run) / "model", Path(run)):
         if (folder / "model.json").is_file():
             return folder
     if (Path(run) / "config.json").is_file():
         raise UserError(f"{run}: not trained to the end yet; continue it with: ct-jax train ... --out {run} --resume")
-    raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or zoo:NAME")
+    raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or {_zoo_words()}")
 
 
 def load_model(run: str) -> TrainedModel:
@@ -74,15 +78,18 @@ def load_model(run: str) -> TrainedModel:
         UserError: there is none, or it is damaged.
     """
     folder = model_folder(run)
-    meta = read_json(folder / "model.json")
+    file = folder / "model.json"
+    mend = f"delete {folder} and continue the run with --resume" if folder.name == "model" else "fetch it anew"
+    meta = read_json(file, mend=mend)
     try:
-        robot, values, made = meta["robot"], meta["settings"], meta.get("made", {})
-    except (KeyError, TypeError, AttributeError):
-        raise UserError(f"{folder / 'model.json'}: not a model's description; train again") from None
-    settings = from_dict(values)
+        robot, made = meta["robot"], meta.get("made", {})
+        settings = from_dict(meta["settings"])
+        get_robot(robot)
+    except (KeyError, TypeError, UserError) as bad:
+        raise UserError(f"{file}: not a model's description ({bad}); {mend}") from None
     policy, controller = blank_model(robot, settings)
     like = jax.eval_shape(lambda: _arrays(policy, controller))
-    arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like))
+    arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like, mend=mend))
     policy = policy.replace(params=arrays["transformer"], value_params=arrays["value"])
     controller = controller.replace(normalizer=arrays["normalizer"], policy=arrays["controller"])
     return TrainedModel(robot, settings, policy, controller, made)

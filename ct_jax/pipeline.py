@@ -1,32 +1,21 @@
 """Algorithm 1, stage by stage: prm, controller, collect, fit, finetune, evaluate, report.
 
-Each stage writes into its own folder of the run and ends with ``done.json``; a finished stage is read back instead of
-run again. ``config.json`` says what the run is of, and a run is only continued as what it was begun.
+Each stage writes into its own folder of the run; a finished stage is read back instead of run again, and what an
+interrupted one has finished is kept.
 """
 
-import platform
-import re
+import functools
 import shutil
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib import metadata
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from ct_envs import Maze, MazeEnv, UserError, load_maze, stack_mazes
-from ct_envs.maze import draw_walls, unpadded
-from ct_envs.robots import get_robot
+from ct_envs import Maze, MazeEnv, UserError, load_maze
+from ct_envs.robots import Robot
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
 from ct_jax.collect import collect
@@ -36,141 +25,16 @@ from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model
 from ct_jax.policy import TransformerPolicy
-from ct_jax.presets import Settings, to_dict
 from ct_jax.prm import Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
 from ct_jax.report import write_report
+from ct_jax.run import Run, join_mazes, open_run, slug
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
 from ct_jax.value import ValueNetwork
 
-STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
-
-
-@dataclass(frozen=True)
-class Run:
-    """A run: a folder, and what it is of."""
-
-    folder: Path
-    robot: str
-    preset: str
-    settings: Settings
-    mazes: dict[str, Maze]  # trained in
-    eval_mazes: dict[str, Maze]  # evaluated in besides them
-    seed: int
-    engine: str
-
-    def env(self, **options: Any) -> MazeEnv:
-        """The run's environment, with options of ``MazeEnv``."""
-        return MazeEnv(self.robot, engine=self.engine, map_cell_m=self.settings.model.map_cell_m, **options)
-
-    def key(self, stage: str) -> jax.Array:
-        """The stage's own randomness."""
-        return jax.random.fold_in(jax.random.key(self.seed), STAGES.index(stage))
-
-    @property
-    def stacked(self) -> Maze:
-        return stack_mazes(list(self.mazes.values()))
-
-
-# ------------------------------------------------------------------------------------------------ the run's folder
-
-
-def open_run(run: Run, *, resume: bool) -> None:
-    """Make the run's folder, or check that the one there is the same run.
-
-    Raises:
-        UserError: the folder is in use and ``resume`` is not given, or it is another run's.
-    """
-    config = run.folder / "config.json"
-    if run.folder.exists() and any(run.folder.iterdir()):
-        if not config.is_file():
-            raise UserError(f"{run.folder}: not empty and no run folder; choose another with --out")
-        before, now = read_json(config), _identity(run)
-        for name, value in now.items():
-            if before.get(name) != value:
-                shown = (before.get(name), value) if isinstance(value, str | int) else ("others", "these")
-                raise UserError(
-                    f"{config}: a run with {name} {shown[0]}, not {shown[1]}; choose another folder with --out"
-                )
-        if not resume:
-            raise UserError(f"{run.folder}: holds a run already; continue it with --resume or choose another --out")
-        return
-    run.folder.mkdir(parents=True, exist_ok=True)
-    write_json(config, _identity(run) | provenance())
-
-
-def _identity(run: Run) -> dict[str, Any]:
-    def texts(mazes: dict[str, Maze]) -> dict[str, str]:
-        return {name: draw_walls(unpadded(maze)) for name, maze in mazes.items()}
-
-    settings = _as_json(to_dict(run.settings))
-    return {
-        "robot": run.robot,
-        "preset": run.preset,
-        "seed": run.seed,
-        "engine": run.engine,
-        "mazes": texts(run.mazes),
-        "eval_mazes": texts(run.eval_mazes),
-        "settings": settings,
-    }
-
-
-def _as_json(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _as_json(inner) for name, inner in value.items()}
-    return list(value) if isinstance(value, tuple) else value
-
-
-def provenance() -> dict[str, Any]:
-    """Command, commit, date, hardware and versions: what is needed to make a result again."""
-    git = shutil.which("git")
-    commit = "unknown"
-    if git:
-        here = Path(__file__).parent
-        found = subprocess.run([git, "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True)
-        commit = found.stdout.strip() or commit
-    packages = ("jax", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy", "networkx")
-    return {
-        "command": " ".join(["ct-jax", *sys.argv[1:]] if Path(sys.argv[0]).name == "ct-jax" else sys.argv),
-        "commit": commit,
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "hardware": hardware(),
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in packages},
-    }
-
-
-def hardware() -> str:
-    """The devices in words."""
-    devices = jax.devices()
-    kind = devices[0].device_kind if devices[0].platform != "cpu" else f"{platform.machine()} CPU"
-    return f"{len(devices)} x {kind}, {_cores()} cores"
-
-
-def _cores() -> int:
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def stage_done(run: Run, stage: str) -> dict[str, Any] | None:
-    """What the finished stage said of itself; None if it has not finished."""
-    file = run.folder / stage / "done.json"
-    return read_json(file) if file.is_file() else None
-
-
-@contextmanager
-def _stage(run: Run, stage: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A stage's folder, and a dict of what it says of itself, written last."""
-    folder = run.folder / stage
-    folder.mkdir(exist_ok=True)
-    info: dict[str, Any] = {}
-    begun = time.perf_counter()
-    yield folder, info
-    write_json(folder / "done.json", info | {"wall_s": round(time.perf_counter() - begun, 2)})
-
-
-# ------------------------------------------------------------------------------------------------------ the stages
+MAX_EPISODES = 100_000
+MAX_SEED = 2**32 - 1
 
 
 def train(run: Run, *, resume: bool = False) -> Path:
@@ -178,52 +42,63 @@ def train(run: Run, *, resume: bool = False) -> Path:
 
     Raises:
         UserError: bad input, or a stage that cannot succeed.
+        KeyboardInterrupt: Ctrl-C; ``resume`` goes on from there.
     """
-    open_run(run, resume=resume)
-    metrics = Metrics(run.folder)
-    try:
-        roadmap = _prm(run)
-        controller = _controller(run, roadmap, metrics)
-        data = _collect(run, controller)
-        policy = _fit(run, data, metrics)
+    with open_run(run, resume=resume):
+        metrics = Metrics(run.folder)
+        try:
+            model = _model(run, metrics)
+            _evaluate(run, model)
+        finally:
+            metrics.close()
+        return write_report(run.folder)
+
+
+def _model(run: Run, metrics: Metrics) -> TrainedModel:
+    """The trained model, learned or, if the stages up to it are finished, read back."""
+    last = "finetune" if run.settings.rounds else "fit"
+    folder = run.folder / "model"
+    if run.done(last) is not None and (folder / "model.json").is_file():
+        return load_model(str(run.folder))
+    controller = _controller(run, metrics)
+    data = _collect(run, controller)
+    policy = _fit(run, data, metrics)
+    if run.settings.rounds:
         policy = _finetune(run, policy, controller, data, metrics)
-        save_model(run.folder / "model", TrainedModel(run.robot, run.settings, policy, controller, _made(run)))
-        _evaluate(run, policy, controller)
-    finally:
-        metrics.close()
-    return write_report(run.folder)
-
-
-def _made(run: Run) -> dict[str, Any]:
     config = read_json(run.folder / "config.json")
-    return {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
+    made = {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
+    model = TrainedModel(run.robot, run.settings, policy, controller, made)
+    save_model(folder, model)
+    return model
+
+
+# ------------------------------------------------------------------------------------------ roadmap and controller
 
 
 def _prm(run: Run) -> Roadmap:
-    """The roadmap of the first maze: it gives the controller its edges."""
+    """The roadmap of the first maze: it gives the controller its edges. Building it again takes no longer than reading."""
     maze = next(iter(run.mazes.values()))
-    roadmap = build_roadmap(
-        run.key("prm"), maze, radius_m=get_robot(run.robot).radius_m, config=run.settings.prm
-    )
-    if stage_done(run, "prm") is None:
-        with _stage(run, "prm") as (folder, info):
+    roadmap = build_roadmap(run.key("prm"), maze, radius_m=run.spec.radius_m, config=run.settings.prm)
+    if run.done("prm") is None:
+        with run.stage("prm") as (folder, info):
             np.savez_compressed(folder / "roadmap.npz", points=roadmap.points, edges=roadmap.edges)
             info |= {"points": len(roadmap.points), "edges": len(roadmap.edges)}
     return roadmap
 
 
-def _controller(run: Run, roadmap: Roadmap, metrics: Metrics) -> SacController:
+def _controller(run: Run, metrics: Metrics) -> SacController:
     config = run.settings.sac
-    _, blank = blank_model(run.robot, run.settings)
     file = run.folder / "controller" / "weights.safetensors"
-    if stage_done(run, "controller") is not None:
-        return jax.tree.map(jnp.asarray, load_weights(file, blank))
-    with _stage(run, "controller") as (folder, info), Bar("controller", config.iterations) as bar:
+    if run.done("controller") is not None:
+        _, blank = blank_model(run.robot, run.settings)
+        return _read_weights(run, file, blank)
+    roadmap = _prm(run)
+    with run.stage("controller") as (folder, info), Bar("controller", config.iterations) as bar:
         checkpoints = Checkpoints(folder / "checkpoints")
 
         def on_progress(done: int, values: dict[str, float]) -> None:
-            bar.update(done, f"success {values['success']:.2f}")
             metrics.log("controller", done, **values)
+            bar.update(done, f"success {values['success']:.2f}")
 
         controller, held_out = train_controller(
             run.key("controller"), run.env, roadmap.maze, roadmap, config,
@@ -231,17 +106,25 @@ def _controller(run: Run, roadmap: Roadmap, metrics: Metrics) -> SacController:
         )  # fmt: skip
         checkpoints.close()
         save_weights(file, controller)
-        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
         info |= {"held_out_success": held_out}
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     return controller
+
+
+def _read_weights(run: Run, file: Path, like: Any) -> Any:
+    """Weights of a stage, on the device."""
+    return jax.tree.map(jnp.asarray, load_weights(file, like, mend=run.mend(file.parent.name)))
+
+
+# -------------------------------------------------------------------------------------------- data and transformer
 
 
 def _collect(run: Run, controller: SacController) -> Trajectories:
     config = run.settings.collect
     file = run.folder / "collect" / "trajectories.npz"
-    if stage_done(run, "collect") is not None:
+    if run.done("collect") is not None:
         return storage.load(file)
-    with _stage(run, "collect") as (_, info), Bar("collect", config.trajectories) as bar:
+    with run.stage("collect") as (_, info), Bar("collect", config.trajectories) as bar:
         env = run.env(maps=False, auto_reset=False, horizon=config.horizon)
         data = collect(
             run.key("collect"), env, run.stacked, controller, config, run.settings.prm,
@@ -258,55 +141,78 @@ def describe(data: Trajectories) -> dict[str, Any]:
     return {"trajectories": data.n, "steps": int(length.sum()), "mean_length": float(length.mean()), "bytes": data.nbytes}
 
 
-def _train_network(
-    run: Run, stage: str, name: str, loss: Callable, config: FitConfig, params: Any, data: Trajectories,
-    metrics: Metrics, key: jax.Array,
-) -> Any:  # fmt: skip
-    """Fit one network with a bar, metrics and checkpoints."""
-    with Bar(name, config.updates) as bar:
-        checkpoints = Checkpoints(run.folder / stage / f"checkpoints-{name}")
-
-        def on_progress(done: int, value: float) -> None:
-            bar.update(done, f"loss {value:.4f}")
-            metrics.log(name, done, loss=value)
-
-        learner = Fit(loss, config, run.settings.model.map_cell_m)
-        params = fit(key, learner, params, data, run.stacked, on_progress=on_progress, checkpoints=checkpoints)
-        checkpoints.close()
-    return params
-
-
 def _fit(run: Run, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
-    settings = run.settings
-    policy, _ = blank_model(run.robot, settings)
-    file = run.folder / "fit" / "weights.safetensors"
-    if stage_done(run, "fit") is not None:
-        return jax.tree.map(jnp.asarray, load_weights(file, policy))
-    with _stage(run, "fit") as (folder, info):
-        policy = _fit_both(run, "fit", "", settings.fit, policy, data, metrics, fresh=True)
-        save_weights(file, policy)
-        for left in folder.glob("checkpoints-*"):
-            shutil.rmtree(left, ignore_errors=True)
+    """Value network and transformer, from scratch."""
+    policy, _ = blank_model(run.robot, run.settings)
+    if run.done("fit") is not None:
+        return _fit_both(run, "fit", 0, policy, data, metrics)
+    with run.stage("fit") as (folder, info):
+        policy = _fit_both(run, "fit", 0, policy, data, metrics)
         info |= {"parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params))}
+    _drop_checkpoints(folder)
     return policy
 
 
 def _fit_both(
-    run: Run, stage: str, suffix: str, config: FitConfig, policy: TransformerPolicy, data: Trajectories,
-    metrics: Metrics, *, fresh: bool,
-) -> TransformerPolicy:  # fmt: skip
-    """Train the value network, and train the transformer (on)."""
+    run: Run, stage: str, number: int, policy: TransformerPolicy, data: Trajectories, metrics: Metrics
+) -> TransformerPolicy:
+    """Train the transformer from scratch (round 0) or on (later rounds), and at both ends the value network anew."""
     settings = run.settings
-    keys = jax.random.split(jax.random.fold_in(run.key(stage), sum(map(ord, suffix))), 4)
-    value = ValueNetwork(settings.value.width)
-    value_params = _train_network(
-        run, stage, "value" + suffix, value_loss(value), settings.value.fit, init_params(keys[0], value, data),
-        best_trajectories(data, settings.value), metrics, keys[1],
-    )  # fmt: skip
-    model = ControlTransformer(settings.model, policy.action_size)
-    params = init_params(keys[2], model, data) if fresh else policy.params
-    params = _train_network(run, stage, "fit" + suffix, transformer_loss(model), config, params, data, metrics, keys[3])
+    last = number == settings.rounds
+    suffix = f"-{number}" if number else ""
+    keys = jax.random.split(jax.random.fold_in(run.key(stage), number), 4)
+    value, model = ValueNetwork(settings.value.width), ControlTransformer(settings.model, policy.action_size)
+
+    def train_one(name: str, learner: Fit, params: Any, data: Trajectories, key: jax.Array) -> Any:
+        return _fit_network(run, stage, name + suffix, learner, params, data, metrics, key)
+
+    value_params = policy.value_params
+    if number == 0 or last:
+        learner = _learner(value, settings.value.fit, settings.model.map_cell_m)
+        best = best_trajectories(data, settings.value)
+        value_params = train_one("value", learner, init_params(keys[0], value, data), best, keys[1])
+    config = settings.fit
+    if number:
+        config = (settings.last_fit if last else None) or settings.round_fit or settings.fit
+    params = policy.params if number else init_params(keys[2], model, data)
+    params = train_one("fit", _learner(model, config, settings.model.map_cell_m), params, data, keys[3])
     return policy.replace(params=params, value_params=value_params)
+
+
+@functools.cache
+def _learner(model: ControlTransformer | ValueNetwork, config: FitConfig, map_cell_m: float) -> Fit:
+    """One learner, and so one compilation, for all rounds that train alike."""
+    loss = value_loss(model) if isinstance(model, ValueNetwork) else transformer_loss(model)
+    return Fit(loss, config, map_cell_m)
+
+
+def _fit_network(
+    run: Run, stage: str, name: str, learner: Fit, params: Any, data: Trajectories, metrics: Metrics, key: jax.Array
+) -> Any:  # fmt: skip
+    """Fit one network with a bar, metrics and checkpoints; its weights, once there, are read back."""
+    folder = run.folder / stage
+    file = folder / f"{name}.safetensors"
+    if file.is_file():
+        return _read_weights(run, file, params)
+    with Bar(name, learner.config.updates) as bar:
+        checkpoints = Checkpoints(folder / f"checkpoints-{name}")
+
+        def on_progress(done: int, value: float) -> None:
+            metrics.log(name, done, loss=value)
+            bar.update(done, f"loss {value:.4f}")
+
+        params = fit(key, learner, params, data, run.stacked, on_progress=on_progress, checkpoints=checkpoints)
+        checkpoints.close()
+    save_weights(file, params)
+    return params
+
+
+def _drop_checkpoints(folder: Path) -> None:
+    for left in folder.glob("checkpoints-*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+# ----------------------------------------------------------------------------------------------------- fine-tuning
 
 
 def _finetune(
@@ -314,36 +220,26 @@ def _finetune(
 ) -> TransformerPolicy:
     """Algorithm 4, ``rounds`` times: recoveries join the data, and training goes on."""
     settings = run.settings
-    for i in range(1, settings.rounds + 1):
-        stage = "finetune"
-        folder = run.folder / stage
-        folder.mkdir(exist_ok=True)
-        data = storage.concatenate([data, _recoveries(run, i, policy, controller)])
-        file = folder / f"weights-{i}.safetensors"
-        if (folder / f"done-{i}.json").is_file():
-            policy = jax.tree.map(jnp.asarray, load_weights(file, policy))
-            continue
-        policy = _fit_both(run, stage, f"-{i + 1}", settings.round_fit or settings.fit, policy, data, metrics, fresh=False)
-        save_weights(file, policy)
-        for left in folder.glob("checkpoints-*"):
-            shutil.rmtree(left, ignore_errors=True)
-        write_json(folder / f"done-{i}.json", describe(data))
-    if settings.rounds and stage_done(run, "finetune") is None:
-        with _stage(run, "finetune") as (_, info):
-            info |= {"rounds": settings.rounds} | describe(data)
+    # One environment, and so one compilation, for all rounds.
+    env = run.env(auto_reset=False, horizon=settings.recover.patience + settings.collect.horizon)
+    with run.stage("finetune") as (folder, info):
+        for number in range(1, run.settings.rounds + 1):
+            data = storage.concatenate([data, _recoveries(run, env, number, policy, controller)])
+            policy = _fit_both(run, "finetune", number, policy, data, metrics)
+            _drop_checkpoints(folder)
+        info |= {"rounds": run.settings.rounds} | describe(data)
     return policy
 
 
-def _recoveries(run: Run, i: int, policy: TransformerPolicy, controller: SacController) -> Trajectories:
-    """Failures and recoveries of round i."""
+def _recoveries(run: Run, env: MazeEnv, number: int, policy: TransformerPolicy, controller: SacController) -> Trajectories:
+    """Failures and recoveries of a round."""
     config = run.settings.recover
-    file = run.folder / "finetune" / f"trajectories-{i}.npz"
+    file = run.folder / "finetune" / f"trajectories-{number}.npz"
     if file.is_file():
         return storage.load(file)
-    with Bar(f"recover-{i}", config.recoveries) as bar:
-        env = run.env(auto_reset=False, horizon=config.patience + run.settings.collect.horizon)
+    with Bar(f"recover-{number}", config.recoveries) as bar:
         found = recover(
-            jax.random.fold_in(run.key("finetune"), i), env, run.stacked, policy, controller, config,
+            jax.random.fold_in(run.key("finetune"), number), env, run.stacked, policy, controller, config,
             run.settings.collect, run.settings.prm,
             on_progress=lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
         )  # fmt: skip
@@ -353,35 +249,42 @@ def _recoveries(run: Run, i: int, policy: TransformerPolicy, controller: SacCont
     return found
 
 
-def _evaluate(run: Run, policy: TransformerPolicy, controller: SacController) -> None:
-    if stage_done(run, "evaluate") is not None:
+# ------------------------------------------------------------------------------------------------------ evaluation
+
+
+def _evaluate(run: Run, model: TrainedModel) -> None:
+    """Every method in every maze, seen ones first; each row is kept as soon as it is there."""
+    if run.done("evaluate") is not None:
         return
     env = run.env(auto_reset=False)
-    todo = [(m, k, m in run.mazes) for m in {**run.mazes, **run.eval_mazes} for k in METHODS]
-    rows = []
-    with _stage(run, "evaluate") as (folder, _):
-        for name, method, seen in todo:
-            maze = (run.mazes | run.eval_mazes)[name]
-            pairs = stored_pairs(folder, run.robot, name, maze, run.settings.episodes, run.seed)
-            with Bar(f"{method} in {name}", run.settings.episodes) as bar:
-                episodes = evaluate(
-                    env, maze, pairs, method, policy=policy, controller=controller, prm=run.settings.prm,
-                    on_progress=lambda steps, over, bar=bar: bar.update(over, f"step {steps}"),
-                )  # fmt: skip
-            save_episodes(folder / f"{slug(name)}-{method}.npz", episodes)
-            rows.append(result_row(run.robot, method, name, episodes) | {"seen": seen})
+    with run.stage("evaluate") as (folder, _):
+        rows = []
+        for name, maze in join_mazes(run.mazes, run.eval_mazes).items():
+            pairs = stored_pairs(folder, run.spec, name, maze, run.settings.episodes, run.seed)
+            for method in METHODS:
+                file = folder / f"{slug(name)}-{method}.json"
+                if not file.is_file():
+                    episodes = _evaluate_method(env, maze, pairs, method, model, name)
+                    save_episodes(file.with_suffix(".npz"), episodes)
+                    write_json(file, result_row(run.robot, method, name, episodes) | {"seen": name in run.mazes})
+                rows.append(read_json(file))
         write_json(folder / "results.json", {"rows": rows})
+
+
+def _evaluate_method(
+    env: MazeEnv, maze: Maze, pairs: Pairs, method: str, model: TrainedModel, name: str
+) -> Episodes:
+    with Bar(f"{method} in {name}", len(pairs.start)) as bar:
+        return evaluate(
+            env, maze, pairs, method, policy=model.policy, controller=model.controller, prm=model.settings.prm,
+            on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
+        )  # fmt: skip
 
 
 def result_row(robot: str, method: str, maze: str, episodes: Episodes) -> dict[str, Any]:
     """One line of the table, as ``ct-jax evaluate --json`` prints it."""
     head = {"robot": robot, "method": method, "maze": maze, "episodes": len(episodes.success), "seed": episodes.pairs.seed}
     return head | episodes.summary()
-
-
-def slug(name: str) -> str:
-    """A maze's name as part of a file name."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
 
 
 def save_episodes(file: Path, episodes: Episodes) -> None:
@@ -393,27 +296,15 @@ def save_episodes(file: Path, episodes: Episodes) -> None:
     )  # fmt: skip
 
 
-def stored_pairs(folder: Path, robot: str, name: str, maze: Maze, n: int, seed: int) -> Pairs:
+def stored_pairs(folder: Path, robot: Robot, name: str, maze: Maze, n: int, seed: int) -> Pairs:
     """The evaluation's pairs: drawn once, written down, and read back ever after."""
-    spec = get_robot(robot)
     file = folder / f"pairs-{slug(name)}-{n}-{seed}.json"
     if file.is_file():
         found = read_json(file)
         return Pairs(*(np.asarray(found[k], np.float32) for k in ("start", "goal", "shortest_m")), seed)
-    pairs = draw_pairs(seed, maze, n, radius_m=spec.radius_m, tolerance_m=spec.goal_tolerance_m)
+    pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     write_json(file, {k: getattr(pairs, k).tolist() for k in ("start", "goal", "shortest_m")})
     return pairs
-
-
-def load_mazes(names: tuple[str, ...]) -> dict[str, Maze]:
-    """Mazes by name or file, in order."""
-    return {name: load_maze(name) for name in names}
-
-
-def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The paper's training and evaluation mazes for a robot. Raises UserError for an unknown one."""
-    get_robot(robot)
-    return ("antmaze-large",), ("antmaze-large-eval",)
 
 
 def evaluate_model(run: str, maze: str, *, episodes: int, seed: int, method: str, engine: str) -> dict[str, Any]:
@@ -422,40 +313,20 @@ def evaluate_model(run: str, maze: str, *, episodes: int, seed: int, method: str
     Raises:
         UserError: unknown model, maze or method, or no episodes.
     """
-    if episodes < 1:
-        raise UserError(f"--episodes {episodes}: give at least 1")
-    if seed < 0:
-        raise UserError(f"--seed {seed}: give a number of 0 or more")
+    if not 1 <= episodes <= MAX_EPISODES:
+        raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
+    check_seed(seed)
     if method not in METHODS:
         raise UserError(f"no method named '{method}'; methods: {', '.join(METHODS)}")
-    model, world = load_model(run), load_maze(maze)
+    world = load_maze(maze)
+    model = load_model(run)
     env = MazeEnv(model.robot, engine=engine, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
     robot = env.robot
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    with Bar(f"{method} in {Path(maze).name}", episodes) as bar:
-        done = evaluate(
-            env, world, pairs, method, policy=model.policy, controller=model.controller, prm=model.settings.prm,
-            on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
-        )  # fmt: skip
-    return result_row(model.robot, method, maze, done)
+    return result_row(model.robot, method, maze, _evaluate_method(env, world, pairs, method, model, Path(maze).stem))
 
 
-def print_table(folder: Path) -> None:
-    """Print the results of a run."""
-    print_rows(read_json(folder / "evaluate" / "results.json")["rows"])
-
-
-def print_rows(rows: list[dict[str, Any]]) -> None:
-    """Print results as a table."""
-    table = Table(box=None, header_style="bold")
-    for name in ("maze", "method", "success %", "95 %", "SPL", "return / 100", "collided %", "steps"):
-        table.add_column(name, justify="left" if name in ("maze", "method") else "right")
-    for row in rows:
-        low, high = row["success_ci95"]
-        table.add_row(
-            f"{row['maze']}{' (seen)' if row.get('seen') else ''}", row["method"], f"{100 * row['success_rate']:.0f}",
-            f"{100 * low:.0f}-{100 * high:.0f}", f"{row['spl']:.2f}", f"{row['return_scaled']:.1f}",
-            f"{100 * row['collision_rate']:.0f}", f"{row['steps_mean']:.0f}",
-        )  # fmt: skip
-    Console().print(table)
-
+def check_seed(seed: int) -> None:
+    """Raise UserError unless random keys can be made of the seed."""
+    if not 0 <= seed <= MAX_SEED:
+        raise UserError(f"--seed {seed}: give a number from 0 to {MAX_SEED}")

@@ -24,7 +24,8 @@ class Settings:
     fit: FitConfig = FitConfig()
     recover: RecoverConfig = RecoverConfig()
     rounds: int = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
-    round_fit: FitConfig | None = None  # the training in each round; by default as ``fit``
+    round_fit: FitConfig | None = None  # the training in each round but the last; by default as ``fit``
+    last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
     optimism: float = 1.0  # k: ask for k * V (paper, sec. III-C)
     reprompt: bool = False  # never ask for more than V of the present state
     episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
@@ -36,7 +37,45 @@ PAPER = Settings(
 )
 """The method as published, table II; wants a GPU."""
 
-PRESETS = {"paper": PAPER}
+PUBLISHED = replace(
+    PAPER,
+    model=ModelConfig(layers=3, heads=4, width=128, context=32, context_acting=32),
+    fit=FitConfig(updates=2400, batch=64, steps=32, learning_rate=4e-4, weight_decay=1e-3, warmup=320),
+    value=ValueConfig(fit=FitConfig(updates=2000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)),
+)
+"""The method as published in everything but size: a model, a memory and a number of updates for two CPU cores."""
+
+_LIFTED = FitConfig(batch=40, steps=48, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True)
+
+CPU = replace(
+    PUBLISHED,
+    prm=PrmConfig(margin_m=0.3),
+    collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
+    model=replace(PUBLISHED.model, dropout=0.0),
+    fit=replace(_LIFTED, updates=800),
+    value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
+    recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=150),
+    rounds=8,
+    round_fit=replace(_LIFTED, updates=300, warmup=20),
+    last_fit=replace(_LIFTED, updates=1500, warmup=20, decay=True),
+)
+"""What lifts the method on two CPU cores: a teacher that knows no more than its pupil, free starts, disturbances,
+mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
+
+DEMO = replace(
+    CPU,
+    sac=SacConfig(iterations=400),
+    collect=replace(CPU.collect, trajectories=500),
+    fit=replace(_LIFTED, updates=300),
+    value=ValueConfig(fit=replace(CPU.value.fit, updates=600)),
+    recover=replace(CPU.recover, recoveries=200),
+    rounds=2,
+    round_fit=replace(_LIFTED, updates=150, warmup=20),
+    last_fit=replace(_LIFTED, updates=300, warmup=20, decay=True),
+)
+"""The same in minutes."""
+
+PRESETS = {"demo": DEMO, "cpu": CPU, "published": PUBLISHED, "paper": PAPER}
 
 
 def get_preset(name: str) -> Settings:
@@ -64,7 +103,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
             value=ValueConfig(**value),
             fit=FitConfig(**values["fit"]),
             recover=RecoverConfig(**values["recover"]),
-            round_fit=FitConfig(**values["round_fit"]) if values["round_fit"] else None,
+            **{name: FitConfig(**values[name]) if values[name] else None for name in ("round_fit", "last_fit")},
         )
     except (KeyError, TypeError, AttributeError) as bad:
         raise UserError(f"settings of another version ({bad}); train again") from None

@@ -275,6 +275,7 @@ class RoadmapGuide:
 
     def _sees(self, maze: Maze, position: Float[Array, "N 2"], points: Float[Array, "N n 2"], radius: float) -> jax.Array:
         reach = segment_reach(self.look_m, self.radius_m + self.margin_m, self.cell_m)
+        reach = max(reach, segment_reach(1.5 * self.look_m, self.radius_m, self.cell_m))
         sight = functools.partial(in_sight, radius=radius, reach=reach)
         free = jax.vmap(jax.vmap(sight, (None, None, 0)))(maze, position, points)
         return free & (jnp.linalg.norm(points - position[:, None], axis=-1) <= 1.5 * self.look_m)

@@ -81,6 +81,8 @@ def rollout(
 class Controller(Protocol):
     """pi_c. A pytree, so that its parameters are arguments of compiled programs."""
 
+    action_size: int
+
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
         """Actions from proprioception and the vector to a goal close by [m]."""
         ...
@@ -107,7 +109,7 @@ class Guided:
 
     def init(self, state: State, guide_memory: Any) -> tuple[Any, jax.Array]:
         n = state.done.shape[0]
-        return guide_memory, jnp.zeros((n, self.intend(guide_memory, state)[0].shape[-1]))
+        return guide_memory, jnp.zeros((n, self.controller.action_size))
 
     def intend(self, guide_memory: Any, state: State) -> tuple[jax.Array, Any]:
         """What the controller would do, undisturbed."""

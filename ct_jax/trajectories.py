@@ -4,6 +4,8 @@ A map is a function of the maze and the robot's position, so it is recomputed, e
 thousand trajectories take megabytes, not gigabytes.
 """
 
+import zipfile
+import zlib
 from pathlib import Path
 
 import jax
@@ -17,6 +19,9 @@ from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
+
+
+_PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
 
 
 @struct.dataclass
@@ -41,7 +46,7 @@ class Trajectories:
     @property
     def rtg(self) -> jax.Array:
         """Return-to-go [N, T]: the sum of rewards from each step to the end."""
-        inside = jnp.arange(self.reward.shape[1]) < self.length[:, None]
+        inside = jnp.arange(self.reward.shape[1])[None] < self.length[:, None]
         reward = jnp.where(inside, self.reward, 0.0)
         return jnp.cumsum(reward[:, ::-1], axis=1)[:, ::-1]
 
@@ -58,21 +63,21 @@ def select(trajectories: Trajectories, index: np.ndarray) -> Trajectories:
 def concatenate(parts: list[Trajectories]) -> Trajectories:
     """All trajectories of ``parts``, padded to the longest and no longer."""
     longest = max(int(np.max(np.asarray(part.length), initial=1)) for part in parts)
-    steps = -(-longest // _PAD_STEPS) * _PAD_STEPS
+    fitted = [pad(part, part.n, -(-longest // _PAD_STEPS) * _PAD_STEPS) for part in parts]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *fitted)
 
-    def fit(leaf: np.ndarray) -> np.ndarray:
-        if leaf.ndim < 2 or leaf.shape[1] == 2 and leaf.ndim == 2:
-            return leaf
-        have = leaf.shape[1]
-        if have >= steps:
-            return leaf[:, :steps]
-        return np.pad(leaf, [(0, 0), (0, steps - have)] + [(0, 0)] * (leaf.ndim - 2))
 
-    def join(name: str) -> np.ndarray:
-        leaves = [np.asarray(getattr(part, name)) for part in parts]
-        return np.concatenate(leaves if name in ("goal", "maze", "length") else [fit(leaf) for leaf in leaves])
+def pad(trajectories: Trajectories, n: int, steps: int) -> Trajectories:
+    """The same data in arrays of n trajectories (the further ones empty: never drawn) and of this many steps."""
 
-    return Trajectories(**{name: join(name) for name in Trajectories.__dataclass_fields__})
+    def fit(name: str) -> np.ndarray:
+        leaf = np.asarray(getattr(trajectories, name))
+        if name in _PER_STEP:
+            leaf = leaf[:, :steps]
+            leaf = np.pad(leaf, [(0, 0), (0, steps - leaf.shape[1])] + [(0, 0)] * (leaf.ndim - 2))
+        return np.pad(leaf, [(0, n - leaf.shape[0])] + [(0, 0)] * (leaf.ndim - 1))
+
+    return Trajectories(**{name: fit(name) for name in Trajectories.__dataclass_fields__})
 
 
 def save(trajectories: Trajectories, file: Path) -> None:
@@ -84,9 +89,9 @@ def save(trajectories: Trajectories, file: Path) -> None:
 def load(file: Path) -> Trajectories:
     """Read what ``save`` wrote. Raises UserError naming the file if it is damaged."""
     try:
-        with np.load(file, allow_pickle=False) as data:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as data:
             return Trajectories(**{name: data[name] for name in Trajectories.__dataclass_fields__})
-    except (OSError, KeyError, ValueError, EOFError) as bad:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as bad:
         raise UserError(f"{file}: not a trajectory file ({type(bad).__name__}); collect again") from None
 
 
@@ -117,7 +122,7 @@ def sample_windows(
     mirror: bool = False,
     shift_timestep: int = 0,
 ) -> Window:
-    """Draw pieces of ``steps`` steps, so that each step of the data is equally likely to be in one.
+    """Draw pieces of ``steps`` steps: a trajectory by its length, and any of its whole pieces alike.
 
     Args:
         rtg: ``trajectories.rtg``, computed once.
@@ -132,7 +137,7 @@ def sample_windows(
     length = trajectories.length[which]
     # pieces may begin at any step that leaves them full, or at the start of a short trajectory
     first = (jax.random.uniform(where_key, (batch,)) * (jnp.maximum(length - steps, 0) + 1)).astype(jnp.int32)
-    at = first[:, None] + jnp.arange(steps)
+    at = first[:, None] + jnp.arange(steps)[None]
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731

@@ -152,10 +152,14 @@ class ControlTransformer(nn.Module):
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
         step = jnp.arange(TOKENS * steps) // TOKENS
         mask = band(step, step, context or self.config.context) & jnp.tri(TOKENS * steps, dtype=bool)
-        mask = mask[None] & (jnp.repeat(valid, TOKENS, 1) > 0)[:, None, :] | jnp.eye(TOKENS * steps, dtype=bool)
-        for block in self.blocks:
+        mask = mask[None] & (jnp.repeat(valid, TOKENS, 1) > 0)[:, None, :] | jnp.eye(TOKENS * steps, dtype=bool)[None]
+        for block in self.blocks[:-1]:
             x = block.attend(x, *block.heads(x), mask, deterministic)
-        return self.predict_action(self.norm_out(x[:, 1::TOKENS]))
+        # Of the last block only the state tokens are asked for anything.
+        q, k, v = self.blocks[-1].heads(x)
+        states = slice(1, None, TOKENS)
+        x = self.blocks[-1].attend(x[:, states], q[:, states], k, v, mask[:, states], deterministic)
+        return self.predict_action(self.norm_out(x))
 
     def act(
         self,
@@ -167,10 +171,9 @@ class ControlTransformer(nn.Module):
     ) -> tuple[Float[Array, "N A"], Cache]:
         """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
         t = cache.now
-        before = self.embed_action(cache.action) + self._embed_time(t - 1)
-        new = [before, self._embed_return(rtg) + self._embed_time(t), self._embed_state(maps, proprio, goal) + self._embed_time(t)]
-        x = self.norm_in(jnp.stack(new, 1))
+        new = [self.embed_action(cache.action), self._embed_return(rtg), self._embed_state(maps, proprio, goal)]
         step_of = jnp.array([t - 1, t, t])
+        x = self.norm_in(jnp.stack(new, 1) + self._embed_time(step_of)[None])
         slots = cache.step.shape[1] // TOKENS
         place = jnp.array([(t - 1) % slots * TOKENS + 2, t % slots * TOKENS, t % slots * TOKENS + 1])
         # The first step has no action before it: its token is kept out of sight by a step that no query reaches.

@@ -322,19 +322,21 @@ def sample_free(
     The cell is uniform over the free ones, or over the region of ``free_cells[index]`` if that is given; the point is
     uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are.
     """
-    pick, place = jax.random.split(key)
-    if index is None:
-        low, high = jnp.zeros((), jnp.int32), maze.n_free
-    else:
-        low, high = maze.region_lo[index], maze.region_hi[index]
-    chosen = jax.random.randint(pick, (), low, high)
-    slack = maze.cell_m / 2 - radius - 1e-3
-    offset = jax.random.uniform(place, (2,), minval=-1.0, maxval=1.0) * slack
-    return cell_centre(maze, maze.free_cells[chosen]) + offset, chosen
+    return _place(jax.random.uniform(key, (3,)), maze, radius, index)
 
 
 def sample_pair(key: jax.Array, maze: Maze, *, radius: float) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """A random start and a random goal of the same region, both with clearance ``radius`` [m]."""
-    start_key, goal_key = jax.random.split(key)
-    start, index = sample_free(start_key, maze, radius=radius)
-    return start, sample_free(goal_key, maze, radius=radius, index=index)[0]
+    chance = jax.random.uniform(key, (6,))  # one draw: this runs in every step of every environment
+    start, index = _place(chance[:3], maze, radius)
+    return start, _place(chance[3:], maze, radius, index)[0]
+
+
+def _place(
+    chance: Float[Array, "3"], maze: Maze, radius: float, index: Int[Array, ""] | None = None
+) -> tuple[Float[Array, "2"], Int[Array, ""]]:
+    """``sample_free`` from three numbers in [0, 1)."""
+    low, high = (0, maze.n_free) if index is None else (maze.region_lo[index], maze.region_hi[index])
+    chosen = jnp.minimum(low + (chance[0] * (high - low)).astype(jnp.int32), high - 1)
+    slack = maze.cell_m / 2 - radius - 1e-3
+    return cell_centre(maze, maze.free_cells[chosen]) + (2.0 * chance[1:] - 1.0) * slack, chosen

@@ -106,9 +106,8 @@ class MazeEnv(Env):
 
     def _begin(self, key: jax.Array, state: State) -> State:
         """The first state of an episode, in the maze and with the tasks of ``state``."""
-        task_key, physics_key = jax.random.split(key)
-        start, goal = self._draw_task(task_key, state.info["maze"], state.info["tasks"])
-        physics = self._initial_physics(physics_key, start)
+        start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
+        physics = self._initial_physics(jax.random.fold_in(key, 1), start)
         info = state.info | {"goal": goal, "steps": jnp.zeros((), jnp.int32)}
         return self._observe(physics, state.replace(info=info))
 
@@ -121,7 +120,9 @@ class MazeEnv(Env):
     def _initial_physics(self, key: jax.Array, start: jax.Array) -> PhysicsState:
         model = self.engine.model
         qpos = jnp.asarray(model.qpos0, jnp.float32).at[:2].set(start)
-        qvel = self._reset_velocity * jax.random.normal(key, (model.nv,))
+        qvel = jnp.zeros(model.nv)
+        if self._reset_velocity:
+            qvel = self._reset_velocity * jax.random.normal(key, (model.nv,))
         return PhysicsState(qpos, qvel, jnp.zeros(model.nv))
 
     def _observe(self, physics: PhysicsState, state: State) -> State:

@@ -1,0 +1,260 @@
+"""A run's folder: what the run is of, what made it, and which of its stages are finished.
+
+``config.json`` says what the run is of, and a run is only continued as what it was begun. Each stage has a folder of its
+own, and ``done.json`` in it is written last.
+"""
+
+import fcntl
+import json
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ct_envs import Maze, MazeEnv, UserError, load_maze, maze_names, stack_mazes
+from ct_envs.maze import draw_walls, unpadded
+from ct_envs.robots import Robot, get_robot
+from ct_jax import __version__
+from ct_jax.checkpoint import read_json, write_json
+from ct_jax.presets import Settings, to_dict
+
+STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: a folder, and what it is of."""
+
+    folder: Path
+    robot: str
+    preset: str
+    settings: Settings
+    mazes: dict[str, Maze]  # trained in
+    eval_mazes: dict[str, Maze]  # evaluated in besides them
+    seed: int
+    engine: str
+
+    def env(self, **options: Any) -> MazeEnv:
+        """The run's environment, with options of ``MazeEnv``."""
+        return MazeEnv(self.robot, engine=self.engine, map_cell_m=self.settings.model.map_cell_m, **options)
+
+    def key(self, stage: str) -> jax.Array:
+        """The stage's own randomness."""
+        return jax.random.fold_in(jax.random.key(self.seed), STAGES.index(stage))
+
+    @property
+    def spec(self) -> Robot:
+        """The robot's data."""
+        return get_robot(self.robot)
+
+    @property
+    def stacked(self) -> Maze:
+        """The training mazes along a leading axis."""
+        return stack_mazes(list(self.mazes.values()))
+
+    def done(self, stage: str) -> dict[str, Any] | None:
+        """What the finished stage said of itself; None if it has not finished."""
+        file = self.folder / stage / "done.json"
+        return read_json(file, mend=self.mend(stage)) if file.is_file() else None
+
+    def mend(self, stage: str) -> str:
+        """What to do about a damaged file of a stage."""
+        return f"delete {self.folder / stage} and continue with --resume"
+
+    @contextmanager
+    def stage(self, stage: str) -> Iterator[tuple[Path, dict[str, Any]]]:
+        """A stage's folder, and a dict of what it says of itself, written last; ``wall_s`` is added over interruptions."""
+        folder = self.folder / stage
+        folder.mkdir(exist_ok=True)
+        file, begun = folder / "spent.json", time.perf_counter()
+        before = float(read_json(file).get("wall_s", 0.0)) if file.is_file() else 0.0
+        info: dict[str, Any] = {}
+        try:
+            yield folder, info
+        except BaseException:
+            with suppress(OSError):
+                write_json(file, {"wall_s": round(before + time.perf_counter() - begun, 2)})
+            raise
+        write_json(folder / "done.json", info | {"wall_s": round(before + time.perf_counter() - begun, 2)})
+        file.unlink(missing_ok=True)
+
+
+# ----------------------------------------------------------------------------------------------------------- mazes
+
+
+def load_mazes(names: tuple[str, ...]) -> dict[str, Maze]:
+    """Mazes by name or file, in order; a file's maze is called like the file, without folder and ending.
+
+    Raises:
+        UserError: a maze that cannot be read, or two of one name.
+    """
+    mazes: dict[str, Maze] = {}
+    for given in names:
+        name = given if given in maze_names() else Path(given).stem
+        _add(mazes, name, load_maze(given), given)
+    return mazes
+
+
+def join_mazes(seen: dict[str, Maze], unseen: dict[str, Maze]) -> dict[str, Maze]:
+    """Seen and unseen mazes together. Raises UserError if two of them have one name."""
+    together = dict(seen)
+    for name, maze in unseen.items():
+        _add(together, name, maze, name)
+    return together
+
+
+def _add(mazes: dict[str, Maze], name: str, maze: Maze, given: str) -> None:
+    for other in mazes:
+        if slug(other) == slug(name) and (other != name or maze_text(mazes[other]) != maze_text(maze)):
+            raise UserError(f"{given}: another maze of this run is called '{other}' already; rename the file")
+    mazes.setdefault(name, maze)
+
+
+def maze_text(maze: Maze) -> str:
+    """The maze as its file would show it."""
+    return draw_walls(unpadded(maze))
+
+
+def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The paper's training and evaluation mazes for a robot. Raises UserError for an unknown one."""
+    get_robot(robot)
+    return ("antmaze-large",), ("antmaze-large-eval",)
+
+
+def slug(name: str) -> str:
+    """A maze's name as part of a file name."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+
+
+# ------------------------------------------------------------------------------------------------------ the folder
+
+
+@contextmanager
+def open_run(run: Run, *, resume: bool) -> Iterator[None]:
+    """Make the run's folder, or check that the one there is the same run; no other process may work in it meanwhile.
+
+    Raises:
+        UserError: the folder cannot be made, is in use and ``resume`` is not given, or is another run's.
+    """
+    join_mazes(run.mazes, run.eval_mazes)
+    if run.folder.exists() and not run.folder.is_dir():
+        raise UserError(f"{run.folder}: a file, not a folder; choose another with --out")
+    config = run.folder / "config.json"
+    if config.is_file():
+        _check_same(run, config)
+        if not resume:
+            raise UserError(f"{run.folder}: holds a run already; continue it with --resume or choose another --out")
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as bad:
+        raise UserError(f"{run.folder}: cannot be made ({bad.strerror}); choose another place with --out") from None
+    # What a process left that was killed before it wrote config.json does not count.
+    if not config.is_file() and any(path.suffix not in (".lock", ".part") for path in run.folder.iterdir()):
+        raise UserError(f"{run.folder}: not empty and no run folder; choose another with --out")
+    with _locked(run.folder):
+        if not config.is_file():
+            write_json(config, identity(run) | provenance())
+        yield
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Holds the folder; the system lets go of it when the process ends, however it ends."""
+    with (folder / "run.lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{folder}: another process is training in it; wait for it or stop it") from None
+        yield
+
+
+def identity(run: Run) -> dict[str, Any]:
+    """What a run is of: a run is only continued by one that agrees in all of it."""
+    settings = json.loads(json.dumps(to_dict(run.settings)))  # tuples as lists, as they are read back
+    texts = [{name: maze_text(maze) for name, maze in mazes.items()} for mazes in (run.mazes, run.eval_mazes)]
+    return {
+        "robot": run.robot,
+        "preset": run.preset,
+        "seed": run.seed,
+        "engine": run.engine,
+        "mazes": texts[0],
+        "eval_mazes": texts[1],
+        "settings": settings,
+    }
+
+
+def _check_same(run: Run, config: Path) -> None:
+    before = read_json(config, mend="restore it, or choose another folder with --out")
+    for name, now in identity(run).items():
+        found = _difference(name, before.get(name), now)
+        if found:
+            raise UserError(f"{config}: a run with {found}; choose another folder with --out")
+
+
+def _difference(name: str, before: Any, now: Any) -> str:
+    """The first thing in which two values differ, in words; empty if they do not."""
+    if before == now:
+        return ""
+    if isinstance(before, dict) and isinstance(now, dict):
+        if list(before) != list(now):
+            of_version = name.startswith("settings")
+            return f"{name} of another version" if of_version else f"{name} {', '.join(before)}, not {', '.join(now)}"
+        return next(found for key in now if (found := _difference(f"{name}.{key}", before[key], now[key])))
+    if isinstance(now, str) and "\n" in now:
+        return f"another {name}"
+    return f"{name} {before}, not {now}"
+
+
+# ------------------------------------------------------------------------------------------------------ provenance
+
+
+def provenance() -> dict[str, Any]:
+    """Command, commit, date, hardware and versions: what is needed to make a result again."""
+    packages = ("jax", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy", "networkx")
+    versions = {"ct-jax": __version__, "python": platform.python_version()}
+    return {
+        "command": _command(),
+        "commit": _commit(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "hardware": hardware(),
+        "versions": versions | {name: metadata.version(name) for name in packages},
+    }
+
+
+def _command() -> str:
+    program = Path(sys.argv[0])
+    ours = ["ct-jax"] if program.name in ("ct-jax", "cli.py") else ["python", program.name]
+    return shlex.join([*ours, *sys.argv[1:]])
+
+
+def _commit() -> str:
+    """The commit of this code, if it is the code of a repository and not only installed inside one."""
+    git, here = shutil.which("git"), Path(__file__)
+
+    def ask(*arguments: str) -> str | None:
+        asked = subprocess.run([str(git), *arguments], cwd=here.parent, capture_output=True, text=True)
+        return asked.stdout.strip() if asked.returncode == 0 else None
+
+    tracked = git is not None and ask("ls-files", "--error-unmatch", here.name) is not None
+    return (ask("describe", "--always", "--dirty") if tracked else None) or "unknown"
+
+
+def hardware() -> str:
+    """The devices in words."""
+    devices = jax.devices()
+    kind = devices[0].device_kind if devices[0].platform != "cpu" else f"{platform.machine()} CPU"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return f"{len(devices)} x {kind}, {cores} cores"
