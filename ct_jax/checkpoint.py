@@ -1,7 +1,9 @@
 """What is kept on disk: Orbax for training states, safetensors for weights that are shipped. Nothing is unpickled."""
 
 import json
+import shutil
 import time
+import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +20,7 @@ SAVE_EVERY_S = 60.0
 
 
 def _is_key(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 class Checkpoints:
@@ -31,7 +33,8 @@ class Checkpoints:
             every_s: ``maybe_save`` saves when the last save is older than this [s].
         """
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
-        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+        self._folder = folder.resolve()
+        self._manager = ocp.CheckpointManager(self._folder, options=options)
         self._every_s, self._last = every_s, time.monotonic()
 
     def save(self, step: int, state: Any) -> None:
@@ -50,20 +53,36 @@ class Checkpoints:
             self.save(step, state)
 
     def restore(self, like: Tree) -> tuple[int, Tree] | None:
-        """(step, state) of the newest checkpoint, with the structure of ``like``; None where there is none."""
-        step = self._manager.latest_step()
-        if step is None:
-            return None
+        """(step, state) of the newest whole checkpoint, with the structure of ``like``; None where there is none.
+
+        A damaged one is deleted with a warning, and the one before it is taken.
+        """
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                return step, self._read(step, like)
+            except (ValueError, KeyError, OSError) as bad:
+                folder = self._folder / str(step)
+                reason = " ".join(str(bad).split())[:200]
+                warnings.warn(f"{folder}: damaged checkpoint left out ({reason})", stacklevel=2)
+                shutil.rmtree(folder, ignore_errors=True)
+                self._manager.reload()
+        return None
+
+    def _read(self, step: int, like: Tree) -> Tree:
         leaves, structure = jax.tree.flatten(like)
         plain = {str(i): jax.random.key_data(leaf) if _is_key(leaf) else leaf for i, leaf in enumerate(leaves)}
         found: Any = self._manager.restore(step, args=ocp.args.StandardRestore(plain))  # pyright: ignore[reportCallIssue]
         values = [
             jax.random.wrap_key_data(found[str(i)]) if _is_key(leaf) else found[str(i)] for i, leaf in enumerate(leaves)
         ]
-        return step, jax.tree.unflatten(structure, values)
+        return jax.tree.unflatten(structure, values)
 
     def close(self) -> None:
         self._manager.close()
+
+
+def _text(error: Exception) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else str(error)
 
 
 def _name(path: tuple[Any, ...]) -> str:
@@ -71,13 +90,28 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def save_weights(file: Path, tree: Any) -> None:
-    """Write a pytree of arrays as safetensors, each leaf under its path."""
+    """Write a pytree of arrays as safetensors, each leaf under its path; a reader never sees half of it.
+
+    Raises:
+        UserError: the disk is full or may not be written to.
+    """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    save_file({_name(path): np.ascontiguousarray(leaf) for path, leaf in leaves}, file)
+    part = file.with_name(file.name + ".part")
+    try:
+        save_file({_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}, part)
+    except SafetensorError as bad:
+        part.unlink(missing_ok=True)
+        raise UserError(
+            f"{file}: cannot be written ({_text(bad)}); free some space and continue with --resume"
+        ) from None
+    part.replace(file)
 
 
-def load_weights(file: Path, like: Tree) -> Tree:
+def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it anew") -> Tree:
     """Read weights into the structure of ``like``.
+
+    Args:
+        mend: what the error tells a person to do about a damaged file.
 
     Raises:
         UserError: no safetensors file, a damaged one, or one of other weights (both shapes are shown).
@@ -85,14 +119,15 @@ def load_weights(file: Path, like: Tree) -> Tree:
     try:
         found = load_file(file)
     except (OSError, SafetensorError) as bad:
-        raise UserError(f"{file}: not a whole safetensors file ({bad}); train again or fetch it anew") from None
+        raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {mend}") from None
 
     def take(path: tuple[Any, ...], leaf: Any) -> np.ndarray:
         name = _name(path)
         if name not in found:
-            raise UserError(f"{file}: holds no weights '{name}'; it belongs to another model")
+            raise UserError(f"{file}: holds no weights '{name}'; it belongs to another model; {mend}")
         if found[name].shape != np.shape(leaf):
-            raise UserError(f"{file}: '{name}' has shape {found[name].shape}, this model needs {np.shape(leaf)}")
+            shapes = f"shape {found[name].shape}, this model needs {np.shape(leaf)}"
+            raise UserError(f"{file}: '{name}' has {shapes}; {mend}")
         return found[name]
 
     return jax.tree_util.tree_map_with_path(take, like)
@@ -105,13 +140,18 @@ def write_json(file: Path, value: Any) -> None:
     part.replace(file)
 
 
-def read_json(file: Path) -> Any:
-    """Read JSON. Raises UserError naming the file and the line."""
+def read_json(file: Path, *, mend: str = "delete it and run again") -> dict[str, Any]:
+    """Read a JSON object. Raises UserError naming the file, the line and the mend."""
     try:
-        return json.loads(file.read_text("utf-8"))
+        found = json.loads(file.read_text("utf-8"))
     except FileNotFoundError:
         raise UserError(f"{file}: no such file") from None
     except json.JSONDecodeError as bad:
-        raise UserError(f"{file}:{bad.lineno}: not JSON ({bad.msg}); delete it and run again") from None
-    except (OSError, UnicodeDecodeError) as bad:
-        raise UserError(f"{file}: cannot be read ({bad})") from None
+        raise UserError(f"{file}:{bad.lineno}: not JSON ({bad.msg}); {mend}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{file}: not UTF-8 text; {mend}") from None
+    except OSError as bad:
+        raise UserError(f"{file}: cannot be read ({bad.strerror})") from None
+    if not isinstance(found, dict):
+        raise UserError(f"{file}:1: not a JSON object; {mend}")
+    return found

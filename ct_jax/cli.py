@@ -1,71 +1,107 @@
 """The command line: ``ct-jax train | evaluate | report | mazes``."""
 
 import contextlib
+import functools
 import io
 import json
+import operator
 import os
 import re
-import signal
+import shlex
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
 
 from ct_envs.errors import UserError
+from ct_jax import __version__
+from ct_jax.interrupts import Terminated, interruptible
 
 PROGRAM = "ct-jax"
+BAD_INPUT = 2
 INTERRUPTED = 130
+
+ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then cross mazes without one.
+
+examples:
+  ct-jax mazes                                       which mazes there are
+  ct-jax train point --preset demo --out runs/demo   train the point robot in minutes; writes a report
+  ct-jax evaluate runs/demo --maze unseen-rooms      try the result in a maze it has never seen
+  ct-jax COMMAND --help                              more on a command"""
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a robot end to end: roadmap, controller, trajectories, transformer, evaluation, report."""
+    """Train a robot end to end: roadmap, controller, trajectories, transformer, evaluation, report.
 
-    robot: tyro.conf.Positional[str]
-    """Robot: point."""
-    preset: str = "cpu"
-    """How much of everything: demo (minutes), cpu (an hour on two cores), paper (the published sizes; wants a GPU)."""
-    out: Path | None = None
-    """Run folder. Default: runs/ROBOT-PRESET-SEED."""
-    seed: int = 0
+    Everything goes into one folder. Ctrl-C is safe at any moment: the same command with --resume goes on.
+
+    examples:
+      ct-jax train point --preset demo
+      ct-jax train point --preset demo --resume
+      ct-jax train point --maze my_floor.txt --maze hall --eval-maze my_other_floor.txt --out runs/mine
+
+    A maze file is plain text, '#' for a wall and '.' for free, closed all around; a cell is 4 m wide.
+    """
+
+    robot: Annotated[Positional[str], arg(metavar="ROBOT")]
+    """Robot to train: point."""
+    preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
+    """How much of everything: demo (minutes), cpu (an hour on two cores), published (the bare method at that size) or
+    paper (the published sizes; wants a GPU)."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/ROBOT-PRESET-SEED)")] = None
+    """Run folder."""
+    seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of everything."""
-    maze: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Maze to train in, by name or text file; may be repeated. Default: the paper's, antmaze-large."""
-    eval_maze: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Unseen maze to evaluate in besides; may be repeated. Default: the paper's, antmaze-large-eval."""
-    engine: str = "auto"
-    """Physics: auto, mjx or mujoco. auto is mujoco on CPU and mjx on accelerators."""
-    resume: bool = False
-    """Continue the run in the folder; finished stages are skipped."""
+    maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
+    """Maze to train in, by name or text file. By default the paper's, antmaze-large."""
+    eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
+    """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
+    engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
+    """Physics; auto is mujoco on CPU and mjx on accelerators."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue the run in the folder: finished stages are skipped."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Evaluate a trained model, or the planner or the explorer with its controller, on fixed start-goal pairs."""
+    """Evaluate a trained model, or a planner with its controller, on start-goal pairs that depend on the seed only.
 
-    run: tyro.conf.Positional[str]
+    examples:
+      ct-jax evaluate zoo:point --maze antmaze-large-eval
+      ct-jax evaluate runs/demo --maze my_floor.txt --episodes 20
+      ct-jax evaluate runs/demo --method explorer --json > explorer.json
+    """
+
+    run: Annotated[Positional[str], arg(metavar="RUN")]
     """Run folder, or zoo:point for the model that ships with the package."""
-    maze: str = "antmaze-large"
+    maze: Annotated[str, arg(metavar="NAME|FILE")] = "antmaze-large"
     """Maze by name or text file."""
-    episodes: int = 100
+    episodes: Annotated[int, arg(metavar="N")] = 100
     """Start-goal pairs."""
-    seed: int = 0
-    """Seed of the pairs; the same for every method."""
-    method: str = "ct"
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Seed of the pairs; the same pairs for every method."""
+    method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
     """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
-    engine: str = "auto"
-    """Physics: auto, mjx or mujoco."""
-    json: bool = False
+    engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
+    """Physics; auto is mujoco on CPU and mjx on accelerators."""
+    json: FlagCreatePairsOff[bool] = False
     """Print one JSON object and nothing else."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """Write the report of a run again, from what is on disk."""
+    """Write report.html and report.png of a run again, from what is on disk; an unfinished run has one, too.
 
-    run: tyro.conf.Positional[Path]
+    example:
+      ct-jax report runs/demo
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder."""
 
 
@@ -74,106 +110,177 @@ class Mazes:
     """List the named mazes, each with a small picture."""
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Mazes, tyro.conf.subcommand("mazes")]
-)
+COMMANDS = {"train": Train, "evaluate": Evaluate, "report": Report, "mazes": Mazes}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments == ["--version"]:
-        from ct_jax import __version__
-
+    if arguments[:1] == ["--version"]:
         print(f"{PROGRAM} {__version__}")
         return 0
+    return guarded(lambda: _run(arguments), go_on=_how_to_go_on(arguments))
+
+
+def guarded(action: Callable[[], None], *, go_on: str = "the same command continues") -> int:
+    """Run something and return its exit status; what goes wrong is told in one line on stderr.
+
+    Args:
+        go_on: what a person whose Ctrl-C stopped it should know.
+    """
     try:
-        command = _parse(arguments)
-        _prepare_jax()
-        {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes}[type(command)](command)
+        with interruptible():
+            action()
+            sys.stdout.flush()
         return 0
     except UserError as bad:
-        print(f"error: {' '.join(str(bad).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped; what is finished is kept, --resume continues", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
+        return _fail(str(bad))
+    except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as bad:  # a full disk, no permission, ...
+        where = f"{bad.filename}: " if bad.filename else ""
+        return _fail(f"{where}{bad.strerror or bad}; make room or choose another place, what is finished is kept")
+    except KeyboardInterrupt as stop:
+        print(f"stopped; {go_on}", file=sys.stderr)
+        return 0 if isinstance(stop, Terminated) else INTERRUPTED
+
+
+def _run(arguments: list[str]) -> None:
+    command = _parse(arguments)
+    {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes}[type(command)](command)
+
+
+def _fail(reason: str) -> int:
+    print(f"error: {' '.join(reason.split())}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def _how_to_go_on(arguments: list[str]) -> str:
+    if arguments[:1] != ["train"]:
+        return "run it again"
+    again = arguments if "--resume" in arguments else [*arguments, "--resume"]
+    return f"what is finished is kept, continue with: {shlex.join([PROGRAM, *again])}"
+
+
+# --------------------------------------------------------------------------------------------------------- parsing
 
 
 def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
     """Parse with tyro, but say what is wrong in one line."""
+    chosen = arguments[0] if arguments else ""
+
+    def brief(kind: type) -> str | None:
+        return None if chosen in COMMANDS else (kind.__doc__ or "").partition("\n")[0]
+
+    commands = [Annotated[kind, subcommand(name, description=brief(kind))] for name, kind in COMMANDS.items()]
+    choice: Any = functools.reduce(operator.or_, commands)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(Command, prog=PROGRAM, description=__doc__, args=arguments)  # pyright: ignore
+            return tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments)
     except SystemExit as stop:
         if not stop.code:
             raise
-        text = re.sub(r"[╭╮╰╯─│]+", " ", said.getvalue())
-        text = re.sub(r"Parsing error|For full helptext.*", " ", text, flags=re.DOTALL)
-        raise UserError(f"{' '.join(text.split()) or 'unusable arguments'}; see {PROGRAM} --help") from None
+        program = f"{PROGRAM} {chosen}" if chosen in COMMANDS else PROGRAM
+        raise UserError(f"{_reason(said.getvalue())}; see {program} --help") from None
 
 
-def _prepare_jax() -> None:
-    """Exact float32 products (TF32 hurts physics and learning), and a private cache of compiled programs."""
-    with contextlib.redirect_stdout(io.StringIO()):  # brax says that warp, which we do not use, is missing
+def _reason(text: str) -> str:
+    """The gist of tyro's error box."""
+    gist = " ".join(re.sub(r"^╭.*╮$|[╰╯│─]", " ", text, flags=re.MULTILINE).split())
+    gist = re.sub(r"(Argument helptext|For full helptext|Perhaps you meant|Available subcommands).*", "", gist)
+    gist = re.sub(r"Missing from [\w -]+:", "missing:", gist).replace(" (required)", "")
+    gist = re.sub(r"Expected one of {(.*)}\.", r"give a command: \1", gist)
+    gist = re.sub(r"invalid literal for int\(\) with base 10: (.*)", r"\1 is no whole number", gist.strip())
+    gist = gist.replace("Unrecognized options:", "unknown:").replace("Error parsing ", "").strip(" .")
+    return gist or "unusable arguments"
+
+
+# -------------------------------------------------------------------------------------------------------- commands
+
+
+def prepare_jax() -> None:
+    """One CPU device a core, exact float32 products, and a private cache of compiled programs."""
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX says that warp, which we do not use, is missing
         import jax
 
-        import ct_jax.pipeline
-    jax.config.update("jax_default_matmul_precision", "highest")
+        import ct_jax.pipeline  # noqa: F401
+        from ct_jax.run import cores
+    # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
+    jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ct-jax" / "compiled"
     with contextlib.suppress(OSError):
         cache.mkdir(parents=True, exist_ok=True)
         cache.chmod(0o700)  # compiled programs are code: nobody else may put one here
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-    signal.signal(signal.SIGTERM, lambda number, frame: signal.raise_signal(signal.SIGINT))
+        if not jax.config.values["jax_compilation_cache_dir"]:
+            jax.config.update("jax_compilation_cache_dir", str(cache))
+    try:
+        jax.devices()
+    except RuntimeError as bad:
+        raise UserError(f"jax finds no device ({bad}); set JAX_PLATFORMS=cpu or install its plugin") from None
 
 
 def _train(command: Train) -> None:
+    from ct_envs.robots import get_robot
+
+    get_robot(command.robot)  # before what takes seconds
+    prepare_jax()
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
     from ct_jax.presets import get_preset
+    from ct_jax.run import Run, default_mazes, load_mazes
 
-    seen, unseen = pipeline.default_mazes(command.robot)
+    seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
-    if command.seed < 0:
-        raise UserError(f"--seed {command.seed}: give a number of 0 or more")
-    run = pipeline.Run(
+    pipeline.check_seed(command.seed)
+    run = Run(
         folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
         robot=command.robot,
         preset=command.preset,
         settings=get_preset(command.preset),
-        mazes=pipeline.load_mazes(command.maze or seen),
-        eval_mazes=pipeline.load_mazes(command.eval_maze or unseen),
+        mazes=load_mazes(command.maze or seen),
+        eval_mazes=load_mazes(command.eval_maze or unseen),
         seed=command.seed,
         engine=command.engine,
     )
     report = pipeline.train(run, resume=command.resume)
-    pipeline.print_table(run.folder)
+    print_rows(pipeline.results(run.folder))
     print(f"model:  {run.folder / 'model'}\nreport: {report}")
 
 
 def _evaluate(command: Evaluate) -> None:
-    from ct_jax import pipeline
+    with _stdout_to_stderr() if command.json else contextlib.nullcontext():
+        prepare_jax()
+        from ct_jax import pipeline
 
-    row = pipeline.evaluate_model(
-        command.run,
-        command.maze,
-        episodes=command.episodes,
-        seed=command.seed,
-        method=command.method,
-        engine=command.engine,
-    )
+        row = pipeline.evaluate_model(
+            command.run,
+            command.maze,
+            episodes=command.episodes,
+            seed=command.seed,
+            method=command.method,
+            engine=command.engine,
+        )
     if command.json:
         print(json.dumps(row))
     else:
-        pipeline.print_rows([row])
+        print_rows([row])
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr() -> Iterator[None]:
+    """Whatever libraries print, C code included, goes to stderr."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _report(command: Report) -> None:
@@ -194,6 +301,35 @@ def _mazes(command: Mazes) -> None:
         return Panel(text, title=name, expand=False)
 
     Console().print(Columns([picture(name) for name in maze_names()]))
+
+
+# ----------------------------------------------------------------------------------------------------------- table
+
+Row = dict[str, Any]
+_COLUMNS: dict[str, Callable[[Row], str]] = {
+    "maze": lambda row: f"{row['maze']}{' (seen)' if row.get('seen') else ''}",
+    "method": lambda row: row["method"],
+    "success %": lambda row: f"{100 * row['success_rate']:.0f}",
+    "95 %": lambda row: "-".join(f"{100 * end:.0f}" for end in row["success_ci95"]),
+    "SPL": lambda row: f"{row['spl']:.2f}",
+    "return / 100": lambda row: f"{row['return_scaled']:.1f}",
+    "collided %": lambda row: f"{100 * row['collision_rate']:.0f}",
+    "steps": lambda row: f"{row['steps_mean']:.0f}",
+}
+
+
+def print_rows(rows: list[Row]) -> None:
+    """Print results as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold")
+    for name in _COLUMNS:
+        table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*(show(row) for show in _COLUMNS.values()))
+    console = Console()
+    console.print(table, width=None if console.is_terminal else 120)
 
 
 if __name__ == "__main__":

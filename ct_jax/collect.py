@@ -11,6 +11,7 @@ from brax.envs.base import State
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.explorer import ExplorerGuide
+from ct_jax.interrupts import raise_if_interrupted
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, stack_tables
 from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
@@ -53,6 +54,7 @@ def run_episodes(
         state, memory, steps = rollout(env, policy, state, memory, jax.random.fold_in(key, i), chunk)  # pyright: ignore
         parts.append(jax.tree.map(np.asarray, steps))
         over = int((np.asarray(state.done) > 0).sum())
+        raise_if_interrupted()
         if on_progress is not None:
             on_progress((i + 1) * chunk, over)
         if over == state.done.shape[0]:

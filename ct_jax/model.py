@@ -3,7 +3,7 @@
 ``weights.safetensors`` holds the arrays, ``model.json`` the robot, the settings and where they came from.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -88,37 +88,40 @@ def load_model(run: str) -> TrainedModel:
     except (KeyError, TypeError, UserError) as bad:
         raise UserError(f"{file}: not a model's description ({bad}); {mend}") from None
     policy, controller = blank_model(robot, settings)
-    like = jax.eval_shape(lambda: _arrays(policy, controller))
+    like = _arrays(policy, controller)
     arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like, mend=mend))
-    policy = policy.replace(params=arrays["transformer"], value_params=arrays["value"])
-    controller = controller.replace(normalizer=arrays["normalizer"], policy=arrays["controller"])
+    policy = replace(policy, params=arrays["transformer"], value_params=arrays["value"])
+    controller = replace(controller, normalizer=arrays["normalizer"], policy=arrays["controller"])
     return TrainedModel(robot, settings, policy, controller, made)
 
 
 def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController]:
-    """An untrained policy and controller of the right sizes, for their structure."""
+    """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
     env = MazeEnv(get_robot(robot), engine="mujoco")
-    key = jax.random.key(0)
     maps, proprio, goal, *rest = sample_inputs(env.proprio_size, env.action_size)
     transformer = ControlTransformer(settings.model, env.action_size)
     value = ValueNetwork(settings.value.width)
     size = env.proprio_size + 2
-    policy = TransformerPolicy(
-        params=jax.jit(transformer.init)(key, maps, proprio, goal, *rest),
-        value_params=jax.jit(value.init)(key, maps, proprio, goal),
-        config=settings.model,
-        action_size=env.action_size,
-        value_width=settings.value.width,
-        optimism=settings.optimism,
-        reprompt=settings.reprompt,
-    )
-    controller = SacController(
-        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
-        policy=controller_networks(size, env.action_size, settings.sac.hidden).policy_network.init(key),
-        action_size=env.action_size,
-        hidden=settings.sac.hidden,
-    )
-    return policy, controller
+
+    def build(key: jax.Array) -> tuple[TransformerPolicy, SacController]:
+        policy = TransformerPolicy(
+            params=transformer.init(key, maps, proprio, goal, *rest),
+            value_params=value.init(key, maps, proprio, goal),
+            config=settings.model,
+            action_size=env.action_size,
+            value_width=settings.value.width,
+            optimism=settings.optimism,
+            reprompt=settings.reprompt,
+        )
+        controller = SacController(
+            normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
+            policy=controller_networks(size, env.action_size, settings.sac.hidden).policy_network.init(key),
+            action_size=env.action_size,
+            hidden=settings.sac.hidden,
+        )
+        return policy, controller
+
+    return jax.eval_shape(build, jax.random.key(0))
 
 
 def _arrays(policy: TransformerPolicy, controller: SacController) -> dict[str, Any]:

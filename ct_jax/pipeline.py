@@ -6,7 +6,7 @@ interrupted one has finished is kept.
 
 import functools
 import shutil
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from ct_jax.value import ValueNetwork
 
 MAX_EPISODES = 100_000
 MAX_SEED = 2**32 - 1
+PAIR_ARRAYS = ("start", "goal", "shortest_m")
 
 
 def train(run: Run, *, resume: bool = False) -> Path:
@@ -76,7 +77,7 @@ def _model(run: Run, metrics: Metrics) -> TrainedModel:
 
 
 def _prm(run: Run) -> Roadmap:
-    """The roadmap of the first maze: it gives the controller its edges. Building it again takes no longer than reading."""
+    """The roadmap of the first maze: it gives the controller its edges. Built again as quickly as it would be read."""
     maze = next(iter(run.mazes.values()))
     roadmap = build_roadmap(run.key("prm"), maze, radius_m=run.spec.radius_m, config=run.settings.prm)
     if run.done("prm") is None:
@@ -123,7 +124,7 @@ def _collect(run: Run, controller: SacController) -> Trajectories:
     config = run.settings.collect
     file = run.folder / "collect" / "trajectories.npz"
     if run.done("collect") is not None:
-        return storage.load(file)
+        return _read_trajectories(run, file)
     with run.stage("collect") as (_, info), Bar("collect", config.trajectories) as bar:
         env = run.env(maps=False, auto_reset=False, horizon=config.horizon)
         data = collect(
@@ -135,10 +136,18 @@ def _collect(run: Run, controller: SacController) -> Trajectories:
     return data
 
 
+def _read_trajectories(run: Run, file: Path) -> Trajectories:
+    try:
+        return storage.load(file)
+    except UserError as bad:
+        raise UserError(f"{bad}: {run.mend(file.parent.name)}") from None
+
+
 def describe(data: Trajectories) -> dict[str, Any]:
     """Size of a dataset in words and numbers."""
     length = np.asarray(data.length)
-    return {"trajectories": data.n, "steps": int(length.sum()), "mean_length": float(length.mean()), "bytes": data.nbytes}
+    counts = {"trajectories": data.n, "steps": int(length.sum()), "bytes": data.nbytes}
+    return counts | {"mean_length": float(length.mean())}
 
 
 def _fit(run: Run, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
@@ -168,15 +177,16 @@ def _fit_both(
 
     value_params = policy.value_params
     if number == 0 or last:
-        learner = _learner(value, settings.value.fit, settings.model.map_cell_m)
+        learner = _learner(value, settings.value.fit, settings.model.map_cell_m)  # pyright: ignore[reportArgumentType]
         best = best_trajectories(data, settings.value)
         value_params = train_one("value", learner, init_params(keys[0], value, data), best, keys[1])
     config = settings.fit
     if number:
         config = (settings.last_fit if last else None) or settings.round_fit or settings.fit
     params = policy.params if number else init_params(keys[2], model, data)
-    params = train_one("fit", _learner(model, config, settings.model.map_cell_m), params, data, keys[3])
-    return policy.replace(params=params, value_params=value_params)
+    learner = _learner(model, config, settings.model.map_cell_m)  # pyright: ignore[reportArgumentType]
+    params = train_one("fit", learner, params, data, keys[3])
+    return replace(policy, params=params, value_params=value_params)
 
 
 @functools.cache
@@ -231,12 +241,14 @@ def _finetune(
     return policy
 
 
-def _recoveries(run: Run, env: MazeEnv, number: int, policy: TransformerPolicy, controller: SacController) -> Trajectories:
+def _recoveries(
+    run: Run, env: MazeEnv, number: int, policy: TransformerPolicy, controller: SacController
+) -> Trajectories:
     """Failures and recoveries of a round."""
     config = run.settings.recover
     file = run.folder / "finetune" / f"trajectories-{number}.npz"
     if file.is_file():
-        return storage.load(file)
+        return _read_trajectories(run, file)
     with Bar(f"recover-{number}", config.recoveries) as bar:
         found = recover(
             jax.random.fold_in(run.key("finetune"), number), env, run.stacked, policy, controller, config,
@@ -271,9 +283,7 @@ def _evaluate(run: Run, model: TrainedModel) -> None:
         write_json(folder / "results.json", {"rows": rows})
 
 
-def _evaluate_method(
-    env: MazeEnv, maze: Maze, pairs: Pairs, method: str, model: TrainedModel, name: str
-) -> Episodes:
+def _evaluate_method(env: MazeEnv, maze: Maze, pairs: Pairs, method: str, model: TrainedModel, name: str) -> Episodes:
     with Bar(f"{method} in {name}", len(pairs.start)) as bar:
         return evaluate(
             env, maze, pairs, method, policy=model.policy, controller=model.controller, prm=model.settings.prm,
@@ -283,17 +293,16 @@ def _evaluate_method(
 
 def result_row(robot: str, method: str, maze: str, episodes: Episodes) -> dict[str, Any]:
     """One line of the table, as ``ct-jax evaluate --json`` prints it."""
-    head = {"robot": robot, "method": method, "maze": maze, "episodes": len(episodes.success), "seed": episodes.pairs.seed}
-    return head | episodes.summary()
+    pairs = {"episodes": len(episodes.success), "seed": episodes.pairs.seed}
+    return {"robot": robot, "method": method, "maze": maze} | pairs | episodes.summary()
 
 
 def save_episodes(file: Path, episodes: Episodes) -> None:
     """Write what happened, for the report's pictures."""
-    asked = {} if episodes.asked is None else {"asked": episodes.asked}
-    np.savez_compressed(
-        file, path=episodes.path, success=episodes.success, collided=episodes.collided, steps=episodes.steps,
-        returns=episodes.returns, start=episodes.pairs.start, goal=episodes.pairs.goal, **asked,
-    )  # fmt: skip
+    arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "steps", "returns")}
+    arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
+    arrays |= {} if episodes.asked is None else {"asked": episodes.asked}
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def stored_pairs(folder: Path, robot: Robot, name: str, maze: Maze, n: int, seed: int) -> Pairs:
@@ -301,10 +310,16 @@ def stored_pairs(folder: Path, robot: Robot, name: str, maze: Maze, n: int, seed
     file = folder / f"pairs-{slug(name)}-{n}-{seed}.json"
     if file.is_file():
         found = read_json(file)
-        return Pairs(*(np.asarray(found[k], np.float32) for k in ("start", "goal", "shortest_m")), seed)
+        start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
+        return Pairs(start, goal, shortest_m, seed)
     pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    write_json(file, {k: getattr(pairs, k).tolist() for k in ("start", "goal", "shortest_m")})
+    write_json(file, {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS})
     return pairs
+
+
+def results(folder: Path) -> list[dict[str, Any]]:
+    """The rows of a run's table."""
+    return read_json(folder / "evaluate" / "results.json")["rows"]
 
 
 def evaluate_model(run: str, maze: str, *, episodes: int, seed: int, method: str, engine: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What a person sees and what is logged while a stage runs: a bar with the time left, metrics.jsonl, TensorBoard."""
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -10,16 +11,23 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
 
-_PLAIN_EVERY_S = 15.0  # where there is no terminal, a line this often
+from ct_jax.interrupts import raise_if_interrupted
+
+PLAIN_EVERY_S = 15.0  # where there is no terminal, a line this often
 
 
 class Bar:
     """Progress of one stage on stderr: a live bar on a terminal, a line now and then elsewhere."""
 
-    def __init__(self, name: str, total: int):
+    def __init__(self, name: str, total: int, *, console: Console | None = None):
+        """
+        Args:
+            console: where to show it; by default stderr.
+        """
         self.name, self.total = name, total
         self._begun = self._spoke = time.monotonic()
-        console = Console(stderr=True)
+        self._first: int | None = None
+        console = console or Console(stderr=True)
         self._live = None
         if console.is_terminal:
             self._live = Progress(
@@ -40,14 +48,23 @@ class Bar:
             self._say(f"done in {time.monotonic() - self._begun:.0f} s")
 
     def update(self, done: int, note: str = "") -> None:
-        """Show ``done`` of ``total``, and a short note."""
+        """Show ``done`` of ``total``, and a short note. Raises ``KeyboardInterrupt`` if one is waiting."""
         done = min(done, self.total)
         if self._live:
             self._live.update(self._task, completed=done, note=note)
-        elif time.monotonic() - self._spoke >= _PLAIN_EVERY_S:
+        elif time.monotonic() - self._spoke >= PLAIN_EVERY_S:
             self._spoke = time.monotonic()
-            left = (self._spoke - self._begun) * (self.total - done) / max(done, 1)
-            self._say(f"{done}/{self.total}, {left:.0f} s left {note}")
+            self._say(f"{done}/{self.total}{self._left(done)} {note}".rstrip())
+        if self._first is None:
+            self._first, self._begun_at = done, time.monotonic()
+        raise_if_interrupted()
+
+    def _left(self, done: int) -> str:
+        """The time left, from the speed since the first update: a resumed stage does not begin at zero."""
+        if self._first is None or done <= self._first:
+            return ""
+        left = (time.monotonic() - self._begun_at) * (self.total - done) / (done - self._first)
+        return f", {left:.0f} s left"
 
     def _say(self, text: str) -> None:
         print(f"{self.name}: {text}", file=sys.stderr, flush=True)
@@ -57,14 +74,18 @@ class Metrics:
     """Scalars of a run, appended to ``metrics.jsonl`` and to TensorBoard's files in ``tensorboard/``."""
 
     def __init__(self, run: Path):
-        self._file = (run / "metrics.jsonl").open("a", encoding="utf-8")
+        file = run / "metrics.jsonl"
+        _drop_half_line(file)
+        self._file = file.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(run / "tensorboard"))
         self._begun = time.monotonic()
 
     def log(self, stage: str, step: int, **values: float) -> None:
-        """Log the scalars of a stage at a step."""
-        record = {"stage": stage, "step": step, "time_s": round(time.monotonic() - self._begun, 3)}
-        self._file.write(json.dumps(record | values) + "\n")
+        """Log the scalars of a stage at a step. What is not finite is null in the file: JSON knows no other way."""
+        record: dict[str, str | float | None] = {"stage": stage, "step": step}
+        record["time_s"] = round(time.monotonic() - self._begun, 3)
+        record |= {name: value if math.isfinite(value) else None for name, value in values.items()}
+        self._file.write(json.dumps(record) + "\n")
         self._file.flush()
         for name, value in values.items():
             self._board.add_scalar(f"{stage}/{name}", value, step)
@@ -72,3 +93,12 @@ class Metrics:
     def close(self) -> None:
         self._file.close()
         self._board.close()
+
+
+def _drop_half_line(file: Path) -> None:
+    """Cut off the end of a last line that a killed process did not finish."""
+    if not file.is_file():
+        return
+    with file.open("rb+") as opened:
+        text = opened.read()
+        opened.truncate(text.rfind(b"\n") + 1)

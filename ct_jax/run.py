@@ -1,7 +1,7 @@
 """A run's folder: what the run is of, what made it, and which of its stages are finished.
 
-``config.json`` says what the run is of, and a run is only continued as what it was begun. Each stage has a folder of its
-own, and ``done.json`` in it is written last.
+``config.json`` says what the run is of, and a run is only continued as what it was begun. Each stage has a folder of
+its own, and ``done.json`` in it is written last.
 """
 
 import fcntl
@@ -76,7 +76,7 @@ class Run:
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-        """A stage's folder, and a dict of what it says of itself, written last; ``wall_s`` is added over interruptions."""
+        """A stage's folder, and a dict of what it says of itself, written last. ``wall_s`` sums over interruptions."""
         folder = self.folder / stage
         folder.mkdir(exist_ok=True)
         file, begun = folder / "spent.json", time.perf_counter()
@@ -255,6 +255,10 @@ def _commit() -> str:
 def hardware() -> str:
     """The devices in words."""
     devices = jax.devices()
-    kind = devices[0].device_kind if devices[0].platform != "cpu" else f"{platform.machine()} CPU"
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return f"{len(devices)} x {kind}, {cores} cores"
+    accelerators = "" if devices[0].platform == "cpu" else f"{len(devices)} x {devices[0].device_kind}, "
+    return f"{accelerators}{platform.machine()} CPU, {cores()} cores"
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from ct_jax.checkpoint import read_json, write_json
-from ct_jax.cli import print_rows
-from ct_jax.pipeline import Run, default_mazes, load_mazes, train
+from ct_jax.cli import prepare_jax, print_rows
+from ct_jax.pipeline import train
 from ct_jax.presets import Settings
+from ct_jax.run import Run, default_mazes, load_mazes
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -16,6 +17,7 @@ def run_variants(
     robot: str, variants: dict[str, Settings], *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto"
 ) -> list[dict[str, Any]]:
     """Train and evaluate each variant with each seed, continuing what is there; returns all rows."""
+    prepare_jax()
     seen, unseen = default_mazes(robot)
     rows = []
     for name, settings in variants.items():

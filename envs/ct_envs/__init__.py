@@ -1,11 +1,36 @@
-"""Worlds for Control Transformer: mazes as data, robots, physics engines and ``MazeEnv``. Knows nothing of learning."""
+"""Worlds for Control Transformer: mazes as data, robots, physics engines and ``MazeEnv``. Knows nothing of learning.
 
-from ct_envs.errors import UserError
-from ct_envs.maze import Maze, load_maze, make_maze, maze_names, random_walls, stack_mazes
-from ct_envs.maze_env import MazeEnv, Tasks
-from ct_envs.robots import POINT, ROBOTS, Robot
+A name is imported when it is first used: who only wants to look at a maze does not wait for a physics engine.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ct_envs.errors import UserError
+    from ct_envs.maze import Maze, load_maze, make_maze, maze_names, random_walls, stack_mazes
+    from ct_envs.maze_env import MazeEnv, Tasks
+    from ct_envs.robots import POINT, ROBOTS, Robot
 
 __all__ = [
     "POINT", "ROBOTS", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
     "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes",
-]
+]  # fmt: skip
+
+_NAMES = {
+    "errors": ("UserError",),
+    "maze": ("Maze", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes"),
+    "maze_env": ("MazeEnv", "Tasks"),
+    "robots": ("POINT", "ROBOTS", "Robot"),
+}
+_MODULE = {name: module for module, names in _NAMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE:
+        raise AttributeError(f"module 'ct_envs' has no attribute '{name}'")
+    return getattr(import_module(f"ct_envs.{_MODULE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
