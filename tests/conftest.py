@@ -59,7 +59,7 @@ def jit_disabled():
 
 @pytest.fixture(scope="session")
 def wall_distance():
-    """Distance [m] from points [..., 2] to the nearest wall of a grid [H, W], one wall after the other, in float64."""
+    """Distance [m] from points [..., 2] to the nearest wall of a grid [H, W], in NumPy, wall by wall."""
 
     def distance(walls, points, cell_m=4.0):
         points = np.asarray(points, np.float64)
@@ -71,3 +71,51 @@ def wall_distance():
         return nearest
 
     return distance
+
+
+@pytest.fixture(scope="session")
+def push():
+    """A controller that nobody trained, good for the point robot: the speed that is wanted, less the one there is."""
+    import jax.numpy as jnp
+    from flax import struct
+
+    @struct.dataclass
+    class Push:
+        gain: float = 1.0
+        action_size: int = struct.field(pytree_node=False, default=2)
+
+        def __call__(self, proprio, goal):
+            away = jnp.linalg.norm(goal, axis=-1, keepdims=True)
+            wanted = goal * jnp.minimum(2.0, 3.0 / jnp.maximum(away, 1e-6))
+            return self.gain * jnp.clip(wanted / 4.0 + 0.5 * (wanted - proprio), -1.0, 1.0)
+
+    return Push
+
+
+@pytest.fixture(scope="session")
+def toy_data():
+    """Makes random trajectories of the given lengths; ``proprio`` says which trajectory and step it is."""
+    from ct_jax.trajectories import Trajectories
+
+    def make(lengths, *, seed=0, mazes=1, steps=None, side_m=20.0):
+        rng = np.random.default_rng(seed)
+        n, steps = len(lengths), steps or max(lengths)
+
+        def draw(*shape, low=-1.0, high=1.0):
+            return rng.uniform(low, high, (n, *shape)).astype(np.float32)
+
+        which, step = np.meshgrid(np.arange(n), np.arange(steps), indexing="ij")
+        return Trajectories(
+            position=draw(steps, 2, low=4.0, high=side_m - 4.0),
+            proprio=np.stack([which, step], -1).astype(np.float32),
+            action=draw(steps, 2),
+            target=draw(steps, 2),
+            reward=draw(steps, low=-20.0, high=0.0),
+            learn=np.ones((n, steps), np.float32),
+            collision=(draw(steps) > 0.5).astype(np.float32),
+            goal=draw(2, low=4.0, high=side_m - 4.0),
+            maze=rng.integers(0, mazes, n).astype(np.int32),
+            length=np.asarray(lengths, np.int32),
+        )
+
+    return make

@@ -75,7 +75,7 @@ def _observe(state: State) -> jax.Array:
 
 def controller_networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
     """Policy and critics for a controller of these sizes."""
-    return sac_networks.make_saccontroller_networks(
+    return sac_networks.make_sac_networks(
         observation_size,
         action_size,
         preprocess_observations_fn=running_statistics.normalize,
@@ -99,13 +99,12 @@ class SacController:
 
 
 def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Tasks]:
-    """Edges, each in both directions, as training and held-out tasks.
+    """Edges, each in both directions, as training and held-out tasks: an edge's two directions stay together.
 
     Raises:
         UserError: the roadmap has too few edges to hold any out.
     """
-    edges = np.concatenate([roadmap.edges, roadmap.edges[:, ::-1]])
-    edges = np.random.default_rng(seed).permutation(edges)
+    edges = np.random.default_rng(seed).permutation(roadmap.edges)
     n = int(held_out * len(edges))
     if n < 1:
         raise UserError(f"the roadmap has only {len(roadmap.edges)} edges; sample more points or connect farther")
@@ -113,6 +112,7 @@ def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Ta
 
 
 def _tasks(roadmap: Roadmap, edges: np.ndarray) -> Tasks:
+    edges = np.concatenate([edges, edges[:, ::-1]])
     start, goal = (jnp.asarray(roadmap.points[edges[:, i]]) for i in (0, 1))
     return Tasks(start, goal, jnp.asarray(len(edges), jnp.int32))
 

@@ -1,0 +1,70 @@
+"""Settings: what a run writes down is what it was."""
+
+import json
+from dataclasses import fields, is_dataclass, replace
+
+import pytest
+
+from ct_envs import UserError
+from ct_jax.collect import GUIDES
+from ct_jax.finetune import KEEP
+from ct_jax.fit import FitConfig
+from ct_jax.presets import PRESETS, Settings, from_dict, get_preset, to_dict
+
+ALL = PRESETS | {
+    "default": Settings(),
+    "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_settings_survive_being_written(name):
+    settings = ALL[name]
+    again = from_dict(json.loads(json.dumps(to_dict(settings))))
+    assert again == settings
+    assert hash(again) == hash(settings)
+
+
+def test_an_unknown_preset_lists_the_known():
+    for name in PRESETS:
+        assert get_preset(name) is PRESETS[name]
+        with pytest.raises(UserError, match=f"no preset named 'huge'.*{name}"):
+            get_preset("huge")
+
+
+@pytest.mark.parametrize(
+    "break_it",
+    [
+        lambda d: d["fit"].update(momentum=0.9),
+        lambda d: d.pop("model"),
+        lambda d: d.update(sac=None),
+        lambda d: d.update(colour="red"),
+        lambda d: d["value"].pop("fit"),
+    ],
+)
+def test_settings_of_another_version_are_refused(break_it):
+    values = to_dict(Settings())
+    break_it(values)
+    with pytest.raises(UserError, match="another version"):
+        from_dict(values)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_settings_agree_with_themselves(name):
+    """Names exist, sizes divide, and schedules end after they began."""
+    s = ALL[name]
+    assert s.collect.guide in GUIDES and s.collect.starts in ("vertices", "maze") and s.recover.keep in KEEP
+    assert s.model.width % s.model.heads == 0
+    assert s.collect.envs >= 1 and s.collect.reset_interval >= 1
+    for fit in (s.fit, s.round_fit, s.value.fit):
+        assert fit is None or 0 < fit.warmup <= fit.updates or name == "rounds"
+    assert 0 < s.value.top <= 1
+    assert s.sac.warmup * s.sac.envs >= s.sac.batch or s.sac.warmup < s.sac.iterations
+
+
+def test_configs_are_frozen():
+    for config in (Settings(), *(getattr(Settings(), f.name) for f in fields(Settings))):
+        if is_dataclass(config):
+            with pytest.raises(AttributeError):
+                setattr(config, fields(config)[0].name, None)
+            assert replace(config) == config

@@ -1,0 +1,261 @@
+"""Trajectories: nothing is lost on the way from the record of an episode to a window of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ct_envs import UserError, load_maze, make_maze, random_walls, stack_mazes
+from ct_envs.occupancy import local_map
+from ct_jax.trajectories import Trajectories, concatenate, load, mirror_windows, sample_windows, save, select
+
+MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
+LENGTHS = [3, 17, 40]
+CELL = 0.8
+draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "mirror", "shift_timestep"))
+
+
+def fields(data):
+    return {name: np.asarray(getattr(data, name)) for name in data.__dataclass_fields__}
+
+
+def same(a, b) -> None:
+    for name, leaf in fields(a).items():
+        np.testing.assert_array_equal(leaf, getattr(b, name), err_msg=name)
+        assert leaf.dtype == np.asarray(getattr(b, name)).dtype, name
+
+
+# ----------------------------------------------------------------------------------------------- return-to-go
+
+
+@given(st.integers(0, 2**31 - 1), st.lists(st.integers(0, 9), min_size=3, max_size=3))
+@settings(max_examples=20)
+def test_return_to_go_is_the_sum_of_what_is_to_come(toy_data, seed, lengths):
+    data = toy_data(lengths, seed=seed, steps=9)
+    rtg = np.asarray(data.rtg)
+    for i, length in enumerate(lengths):
+        expected = [data.reward[i, t:length].astype(np.float64).sum() for t in range(9)]
+        np.testing.assert_allclose(rtg[i], expected, rtol=1e-5, atol=1e-4)
+
+
+def test_padding_has_no_say_in_the_return(toy_data):
+    data = toy_data(LENGTHS)
+    padding = np.arange(data.reward.shape[1]) >= data.length[:, None]
+    other = data.replace(reward=np.where(padding, np.nan, data.reward))
+    np.testing.assert_array_equal(data.rtg, other.rtg)
+
+
+# ---------------------------------------------------------------------------------------------------- windows
+
+
+def windows(data: Trajectories, seed: int = 0, **options):
+    return draw(jax.random.key(seed), data, data.rtg, MAZES, **{"batch": 64, "steps": 5, "map_cell_m": CELL} | options)
+
+
+def which_step(window, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Trajectory and step [B, S] that pieces are of; after the end of a short one, of its last step."""
+    i = np.asarray(window.proprio)[:, :1, 0].astype(int)
+    return np.broadcast_to(i, window.valid.shape), np.asarray(window.proprio)[..., 1].astype(int)
+
+
+def test_maps_are_what_the_robot_saw_there(toy_data):
+    data = toy_data(LENGTHS, mazes=3)
+    window = windows(data, steps=12)
+    i, t = which_step(window, data)
+    assert set(data.maze[i.ravel()]) == set(data.maze)
+    mazes = jax.tree.map(lambda leaf: leaf[data.maze[i.ravel()]], MAZES)
+    positions, goals = data.position[i, t].reshape(-1, 2), data.goal[i.ravel()]
+    expected = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=CELL))(mazes, positions, goals)
+    np.testing.assert_array_equal(window.map.reshape(expected.shape), expected)
+    np.testing.assert_array_equal(window.goal.reshape(-1, 2), goals - positions)
+
+
+def test_a_window_is_a_piece_of_a_trajectory(toy_data):
+    data = toy_data(LENGTHS)
+    data = data.replace(learn=(np.random.default_rng(0).random(data.learn.shape) < 0.5).astype(np.float32))
+    window = windows(data, steps=5)
+    i, t = which_step(window, data)
+    inside = t < data.length[i]
+    np.testing.assert_array_equal(window.valid, inside)
+    np.testing.assert_array_equal(np.diff(t, axis=1)[inside[:, 1:]], 1)
+    np.testing.assert_array_equal(window.timestep, t[:, :1] + np.arange(5))
+    for name in ("action", "target", "learn"):
+        np.testing.assert_array_equal(getattr(window, name)[inside], getattr(data, name)[i, t][inside], err_msg=name)
+    np.testing.assert_array_equal(np.asarray(window.rtg)[inside], np.asarray(data.rtg)[i, t][inside])
+    assert not np.asarray(window.learn)[~inside].any()
+    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5].any()  # only short ones are cut
+
+
+def test_single_steps_are_drawn_evenly(toy_data):
+    """A chi-square test on all steps of the data, with a fixed seed; padding is never drawn."""
+    data = toy_data([3, 0, 17, 40])
+    counts = np.zeros(data.reward.shape)
+    for seed in range(3):
+        window = windows(data, seed, steps=1, batch=2000)
+        np.add.at(counts, which_step(window, data), 1)
+    inside = np.arange(40) < data.length[:, None]
+    assert not counts[~inside].any()
+    expected = counts.sum() / inside.sum()
+    chi2 = ((counts[inside] - expected) ** 2 / expected).sum()
+    assert chi2 < 2 * inside.sum(), (chi2, inside.sum())
+
+
+def test_each_step_can_be_part_of_a_piece(toy_data):
+    data = toy_data(LENGTHS)
+    window = windows(data, steps=8, batch=2000)
+    i, t = which_step(window, data)
+    seen = np.zeros(data.reward.shape, bool)
+    valid = np.asarray(window.valid) > 0
+    seen[i[valid], t[valid]] = True
+    np.testing.assert_array_equal(seen, np.arange(40) < data.length[:, None])
+    share = np.bincount(i[:, 0], minlength=3) / len(i)
+    np.testing.assert_allclose(share, data.length / data.length.sum(), atol=0.04)
+
+
+def test_shifted_timesteps_keep_their_pace(toy_data):
+    data = toy_data([30])
+    plain, shifted = windows(data), windows(data, shift_timestep=9)
+    shift = np.asarray(shifted.timestep - plain.timestep)
+    assert (shift == shift[:, :1]).all()
+    assert set(shift[:, 0]) == set(range(10))
+    same(shifted.replace(timestep=plain.timestep), plain)
+
+
+# ------------------------------------------------------------------------------------------------- symmetries
+
+
+def test_the_eight_symmetries_are_a_group(toy_data):
+    one = jax.tree.map(lambda leaf: leaf[:1], windows(toy_data([30], seed=3)))
+    images = [mirror_windows(jnp.array([s]), one) for s in range(8)]
+    names = ("map", "proprio", "goal", "action", "target")
+
+    def index(window) -> int:
+        """Which image a window is; there must be one."""
+        equal = [all(np.array_equal(getattr(window, n), getattr(image, n)) for n in names) for image in images]
+        assert sum(equal) == 1
+        return equal.index(True)
+
+    assert [index(image) for image in images] == list(range(8))  # all differ
+    table = np.array([[index(mirror_windows(jnp.array([s]), image)) for image in images] for s in range(8)])
+    for line in (*table, *table.T):
+        assert sorted(line) == list(range(8))  # closed, and each can be undone
+    assert (table[0] == np.arange(8)).all()
+    assert (table != table.T).any()  # rotations and reflections do not commute
+
+
+def turn_world(symmetry: int, mazes, data: Trajectories):
+    """The same episodes in a mirrored world, from nothing but what each bit is said to mean."""
+    side = mazes.shape[0] * 4.0
+    walls, centre = np.asarray(mazes.walls), np.float32(side / 2)
+    points = {"position": np.asarray(data.position) - centre, "goal": np.asarray(data.goal) - centre}
+    vectors = points | {name: np.asarray(getattr(data, name)) for name in ("proprio", "action", "target")}
+    if symmetry & 1:
+        walls, vectors = walls.swapaxes(1, 2), {name: v[..., ::-1] for name, v in vectors.items()}
+    if symmetry & 2:
+        walls, vectors = walls[:, :, ::-1], {name: v * np.float32([-1, 1]) for name, v in vectors.items()}
+    if symmetry & 4:
+        walls, vectors = walls[:, ::-1], {name: v * np.float32([1, -1]) for name, v in vectors.items()}
+    for name in points:
+        vectors[name] = vectors[name] + centre
+    return stack_mazes([make_maze(w) for w in walls]), data.replace(**vectors)
+
+
+@pytest.mark.parametrize("symmetry", range(8))
+def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry):
+    """Positions on a grid of 1/64 m and map cells of 3/4 m: every sum is exact, so equality is, too."""
+    mazes = stack_mazes([make_maze(random_walls(seed, height=12, width=12, density=0.7)) for seed in range(3)])
+    data = toy_data([20, 9], mazes=3, side_m=48.0, seed=symmetry)
+    data = data.replace(
+        position=np.round(data.position * 64) / 64 + 1 / 128, goal=np.round(data.goal * 64) / 64 + 1 / 128
+    )
+    turned_mazes, turned = turn_world(symmetry, mazes, data)
+    options = {"batch": 16, "steps": 4, "map_cell_m": 0.75}
+    window = draw(jax.random.key(0), data, data.rtg, mazes, **options)
+    other = draw(jax.random.key(0), turned, turned.rtg, turned_mazes, **options)
+    assert window.map[:, :, 1].any() and window.map[:, :, 0].any()
+    same(mirror_windows(jnp.full(16, symmetry), window), other)
+
+
+def test_mirroring_draws_all_symmetries(toy_data):
+    data = toy_data([30])
+    plain, mirrored = windows(data), windows(data, mirror=True)
+    found = {
+        s
+        for s in range(8)
+        for i in range(64)
+        if np.array_equal(mirror_windows(jnp.full(64, s), plain).action[i], mirrored.action[i])
+    }
+    assert found == set(range(8))
+
+
+# -------------------------------------------------------------------------------------------- kept and joined
+
+
+def test_saving_and_loading_is_the_identity(toy_data, tmp_path):
+    data = toy_data(LENGTHS, mazes=3)
+    save(data, tmp_path / "data.npz")
+    same(load(tmp_path / "data.npz"), data)
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "text", "half", "one byte", "other arrays", "pickle"])
+def test_a_damaged_file_is_named(toy_data, tmp_path, damage):
+    file = tmp_path / "data.npz"
+    save(toy_data(LENGTHS), file)
+    whole = file.read_bytes()
+    middle = len(whole) // 3
+    match damage:
+        case "missing":
+            file.unlink()
+        case "other arrays":
+            np.savez(file, position=np.zeros(3))
+        case "pickle":
+            np.savez(file, **fields(toy_data(LENGTHS)) | {"goal": np.array([{"a": 1}], dtype=object)})
+        case _:
+            content = {"empty": b"", "text": b"no arrays", "half": whole[: len(whole) // 2]}
+            broken = whole[:middle] + bytes([whole[middle] ^ 0xFF]) + whole[middle + 1 :]
+            file.write_bytes(content.get(damage, broken))
+    with pytest.raises(UserError, match=r"data\.npz"):
+        load(file)
+
+
+@pytest.mark.parametrize("steps", [(2, 40, 300), (64, 65, 2), (7, 7, 7)])
+def test_joining_keeps_everything(toy_data, steps):
+    """Whatever the padding of the parts: it may be cut, but no step is."""
+    parts = [toy_data([1, n // 2, n], seed=n, steps=n + extra) for n, extra in zip(steps, (0, 9, 400), strict=True)]
+    whole = concatenate(parts)
+    assert whole.n == 9
+    single = [(part, i) for part in parts for i in range(part.n)]
+    for k, (part, i) in enumerate(single):
+        length = part.length[i]
+        for name, leaf in fields(part).items():
+            per_step = name not in ("goal", "maze", "length")
+            one, joined = leaf[i], np.asarray(getattr(whole, name))[k]
+            np.testing.assert_array_equal(joined[:length] if per_step else joined, one[:length] if per_step else one)
+    assert whole.position.shape[1] < max(steps) + 64
+
+
+def test_selecting_takes_integers_and_bools(toy_data):
+    data = toy_data(LENGTHS)
+    same(select(data, np.array([2, 0])), concatenate_exact(data, [2, 0]))
+    same(select(data, np.array([True, False, True])), concatenate_exact(data, [0, 2]))
+
+
+def concatenate_exact(data: Trajectories, index: list[int]) -> Trajectories:
+    return Trajectories(**{name: np.stack([leaf[i] for i in index]) for name, leaf in fields(data).items()})
+
+
+def test_a_thousand_trajectories_take_megabytes(toy_data):
+    data = toy_data([128] * 1000)
+    assert data.nbytes == sum(leaf.nbytes for leaf in fields(data).values())
+    assert data.nbytes < 32e6
+
+
+def test_without_compilation_a_window_is_the_same(toy_data):
+    data = toy_data(LENGTHS, mazes=3)
+    compiled = windows(data, batch=2, steps=2)
+    with jax.disable_jit():
+        plain = windows(data, batch=2, steps=2)
+    np.testing.assert_array_equal(plain.map, compiled.map)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), plain, compiled)
