@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ct_envs import UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
-from ct_envs import maze as mazes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+
+from ct_envs import UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
+from ct_envs import maze as mazes
 
 SHAPE = (12, 12)  # all small mazes are padded to it, so that one compiled program serves them
 SIDES = st.integers(5, 12)
@@ -28,9 +29,7 @@ TWO_REGIONS = "#######\n#..#..#\n#.##..#\n#######"
 
 clearances = jax.jit(jax.vmap(mazes.clearance, (None, 0)))
 segments_free = jax.jit(
-    jax.vmap(
-        lambda maze, a, b, radius: mazes.segment_free(maze, a, b, radius=radius, reach=3), (None, 0, 0, None)
-    )
+    jax.vmap(lambda maze, a, b, radius: mazes.segment_free(maze, a, b, radius=radius, reach=3), (None, 0, 0, None))
 )
 
 
@@ -40,9 +39,10 @@ def within_reach(maze, a, b, radius, reach):
     return jax.vmap(ask)(a, b)
 
 
-sample_many = jax.jit(
-    jax.vmap(lambda key, maze, radius: mazes.sample_free(key, maze, radius=radius), (0, None, None))
+in_sight = jax.jit(
+    jax.vmap(lambda maze, a, b, radius: mazes.in_sight(maze, a, b, radius=radius, reach=3), (None, 0, 0, None))
 )
+sample_many = jax.jit(jax.vmap(lambda key, maze, radius: mazes.sample_free(key, maze, radius=radius), (0, None, None)))
 sample_from = jax.jit(
     jax.vmap(
         lambda key, maze, index, radius: mazes.sample_free(key, maze, radius=radius, index=index),
@@ -72,7 +72,7 @@ def regions(walls: np.ndarray) -> int:
     return ndimage.label(~walls)[1]
 
 
-# --------------------------------------------------------------------------------------------------- named layouts
+# ---------------------------------------------------------------------------------------------- named layouts
 
 
 @pytest.mark.parametrize("name", maze_names())
@@ -96,7 +96,7 @@ def test_row_zero_of_a_layout_is_its_last_line():
     assert walls[2].tolist() == [True, False, False, True]
 
 
-# ----------------------------------------------------------------------------------------------------- random mazes
+# ----------------------------------------------------------------------------------------------- random mazes
 
 
 @given(GRIDS)
@@ -153,7 +153,7 @@ def test_random_mazes_refuse_what_is_out_of_range(options):
     assert_one_line(lambda: random_walls(0, **options))
 
 
-# ------------------------------------------------------------------------------------------------- text and back
+# ---------------------------------------------------------------------------------------------- text and back
 
 
 @given(GRIDS)
@@ -212,7 +212,7 @@ def test_a_giant_file_is_refused_at_once(tmp_path):
     begun = time.perf_counter()
     assert_one_line(lambda: load_maze(file), str(file), "at most 1024 x 1024")
     assert_one_line(lambda: mazes.parse_walls(("#" * 10_000 + "\n") * 10_000), "10000 x 10000")
-    assert time.perf_counter() - begun < 5.0
+    assert time.perf_counter() - begun < 5.0  # to read its hundred million cells takes longer
 
 
 def test_the_largest_maze_is_read(tmp_path):
@@ -237,7 +237,7 @@ def test_a_maze_that_outgrows_its_shape_is_refused():
     assert_one_line(lambda: make_maze(random_walls(0, height=13), shape=(12, 12)), "(13, 12)", "(12, 12)")
 
 
-# ------------------------------------------------------------------------------------------------ padding and regions
+# ---------------------------------------------------------------------------------------- padding and regions
 
 
 @given(GRIDS, SEEDS)
@@ -285,7 +285,7 @@ def test_a_stack_holds_each_maze_unchanged():
         assert int(one.n_free) == int(single.n_free)
 
 
-# -------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 @given(GRIDS, SEEDS, st.sampled_from([1.0, 4.0]))
@@ -317,6 +317,20 @@ def test_segment_free_is_exact_around_a_corner():
             nearest = corner - gap * np.sqrt(0.5)
             a, b = (np.float32(nearest + d * np.array([1, -1]))[None] for d in (1.5, -1.5))
             assert bool(segments_free(maze, a, b, np.float32(radius))[0]) is free
+
+
+@given(GRIDS, SEEDS, st.floats(0.1, 1.5))
+@settings(max_examples=25)
+def test_in_sight_is_free_for_a_disc_that_fits_both_ends(wall_distance, walls, seed, radius):
+    maze = make_maze(walls, shape=SHAPE)
+    a, b = draw_segments(seed, walls, 64)
+    share = np.linspace(0, 1, 401)[:, None, None]
+    nearest = wall_distance(maze.walls, a + share * (b - a))
+    disc = np.minimum(radius, 0.98 * np.minimum(nearest[0], nearest[-1]))
+    seen = np.asarray(in_sight(maze, a, b, np.float32(radius)))
+    assert seen[(disc > 0) & (nearest.min(0) > disc + 0.02)].all()
+    assert not seen[nearest.min(0) < np.maximum(disc - 1e-4, 1e-9)].any()
+    assert seen[np.asarray(segments_free(maze, a, b, np.float32(radius + 1e-4)))].all()
 
 
 @given(SEEDS)

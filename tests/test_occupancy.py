@@ -5,10 +5,11 @@ import functools
 import jax
 import numpy as np
 import pytest
-from ct_envs import load_maze, make_maze, random_walls
-from ct_envs.occupancy import MAP_CELLS, local_map
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+
+from ct_envs import load_maze, make_maze, random_walls
+from ct_envs.occupancy import MAP_CELLS, local_map
 
 SEEDS = st.integers(0, 2**31 - 1)
 CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the second is our setting, the first the Turtlebot3's
@@ -35,7 +36,7 @@ def naive(walls: np.ndarray, position, goal, cell_m: float, cells: int = MAP_CEL
 
 
 def draw_pose(seed: int, walls: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """A position anywhere in the array and a goal near its window; no point of the map lies on a cell's border."""
+    """A position anywhere and a goal near its window, such that no point of the map is on a cell's border."""
     rng = np.random.default_rng(seed)
     position = rng.random(2) * np.array(walls.shape[::-1]) * 4.0
     goal = position + rng.uniform(-0.7, 0.7, 2) * MAP_CELLS * cell_m

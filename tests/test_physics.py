@@ -1,0 +1,257 @@
+"""Two engines behind one step: they agree, no wall is ever missing, and a NaN stays where it arose."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mujoco.batch import Batch
+
+from ct_envs import POINT, UserError, load_maze, make_maze, random_walls
+from ct_envs.maze import load_walls
+from ct_envs.physics import (
+    ENGINES,
+    PhysicsState,
+    build_model,
+    make_engine,
+    model_xml,
+    nearest_walls,
+    static_model,
+)
+
+pytestmark = pytest.mark.rank_promotion("allow")  # MJX
+
+N = 32  # robots of a drive; one number, so that one compiled program serves the tests
+LARGE = load_walls("antmaze-large")
+
+
+@pytest.fixture(scope="module")
+def engine():
+    """Of that name, made once: a compiled program belongs to its engine."""
+    return functools.cache(lambda name: make_engine(name, POINT))
+
+
+boxes_at = jax.jit(jax.vmap(nearest_walls, (None, 0)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def step(engine, maze, state, ctrl):
+    walls = jax.vmap(nearest_walls, (None, 0))(maze, state.qpos[:, :2])
+    return jax.vmap(engine.step)(state, ctrl, walls)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def drive(engine, maze, state, ctrls):
+    """States after each of the control steps [T, N, nu], from N states."""
+
+    def once(state, ctrl):
+        walls = jax.vmap(nearest_walls, (None, 0))(maze, state.qpos[:, :2])
+        state = jax.vmap(engine.step)(state, ctrl, walls)
+        return state, state
+
+    return jax.lax.scan(once, state, ctrls)[1]
+
+
+def starts(seed: int, walls: np.ndarray, wall_distance, *, speed: float, n: int = N) -> PhysicsState:
+    """Robots that touch no wall, most of them close to one, at ``speed`` [m/s] in any direction."""
+    rng = np.random.default_rng(seed)
+    free = np.argwhere(~walls)[:, ::-1]
+    points = (free[rng.integers(len(free), size=200 * n)] + rng.random((200 * n, 2))) * 4.0
+    distance = wall_distance(walls, points)
+    points = points[(distance > 0.52) & (distance < 1.0)][:n]
+    angle = rng.uniform(0, 2 * np.pi, n)
+    velocity = speed * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return PhysicsState(*(jnp.asarray(leaf, jnp.float32) for leaf in (points, velocity, 0 * points)))
+
+
+def pushes(seed: int, length: int, n: int = N) -> jax.Array:
+    """Random full throttle, held for some ten steps at a time."""
+    rng = np.random.default_rng(seed)
+    held = rng.uniform(-1.5, 1.5, (-(-length // 10), n, 2)).clip(-1, 1)
+    return jnp.asarray(np.repeat(held, 10, axis=0)[:length], jnp.float32)
+
+
+# -------------------------------------------------------------------------------------------- the two engines
+
+
+def test_engines_agree_in_free_space_and_at_walls(engine, wall_distance):
+    """MJX computes in float32, MuJoCo in float64.
+
+    30 steps of 5 substeps round 150 times, by some 2e-6 m each at coordinates of up to 40 m, and dissipation
+    keeps it from growing. A contact that one engine lacks makes decimetres.
+    """
+    maze = make_maze(LARGE)
+    state, ctrls = starts(0, LARGE, wall_distance, speed=2.0), pushes(0, 30)
+    c = xla = state
+    touching = []
+    for ctrl in ctrls:
+        c, xla = step(engine("mujoco"), maze, c, ctrl), step(engine("mjx"), maze, xla, ctrl)
+        np.testing.assert_allclose(xla.qpos, c.qpos, atol=5e-4)
+        np.testing.assert_allclose(xla.qvel, c.qvel, atol=2e-3)
+        touching.append(wall_distance(LARGE, c.qpos) < 0.5)
+    assert 0.1 < np.mean(touching) < 0.9  # both cases were compared
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mjx"])
+def test_a_step_is_pure(engine, wall_distance, name):
+    """Whatever was stepped before, and whoever is stepped beside it."""
+    maze = make_maze(LARGE)
+    state, other = (starts(seed, LARGE, wall_distance, speed=3.0) for seed in (1, 2))
+    ctrl = pushes(1, 1)[0]
+    first = step(engine(name), maze, state, ctrl)
+    step(engine(name), maze, other, -ctrl)
+    again = step(engine(name), maze, state, ctrl)
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    order = np.random.default_rng(0).permutation(N)
+    shuffled = step(engine(name), maze, jax.tree.map(lambda leaf: leaf[order], state), ctrl[order])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[order], b, atol=1e-6), first, shuffled)
+
+
+def test_nested_vmap_is_one_flat_batch(engine, wall_distance):
+    maze = make_maze(LARGE)
+    state, ctrl = starts(3, LARGE, wall_distance, speed=3.0), pushes(3, 1)[0]
+    inputs = (state, ctrl, boxes_at(maze, state.qpos))
+    grid = jax.tree.map(lambda leaf: leaf.reshape(4, N // 4, *leaf.shape[1:]), inputs)
+    flat = step(engine("mujoco"), maze, state, ctrl)
+    nested = jax.jit(jax.vmap(jax.vmap(engine("mujoco").step)))(*grid)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b.reshape(a.shape), atol=1e-6), flat, nested)
+    one = jax.jit(engine("mujoco").step)(*jax.tree.map(lambda leaf: leaf[0], inputs))  # a batch of one
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[0], b, atol=1e-6), flat, one)
+    shapes = jax.eval_shape(jax.vmap(jax.vmap(engine("mjx").step)), *grid)
+    jax.tree.map(lambda a, b: np.testing.assert_equal(a.shape, b.shape), shapes, nested)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mjx"])
+@pytest.mark.parametrize("what", ["qpos", "qvel", "qacc_warmstart", "ctrl"])
+def test_a_nan_never_reaches_another_robot(engine, wall_distance, monkeypatch, tmp_path, name, what):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
+    maze = make_maze(LARGE)
+    state, ctrl = starts(4, LARGE, wall_distance, speed=3.0), pushes(4, 1)[0]
+    clean = step(engine(name), maze, state, ctrl)
+    sick = np.arange(N) % 5 == 2
+    poison = lambda leaf: jnp.where(sick[:, None], jnp.nan, leaf)  # noqa: E731
+    bad = state if what == "ctrl" else state.replace(**{what: poison(getattr(state, what))})
+    after = step(engine(name), maze, bad, poison(ctrl) if what == "ctrl" else ctrl)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[~sick], b[~sick]), clean, after)
+    if what in ("qpos", "qvel"):
+        assert not np.isfinite(np.asarray(after.qpos)[sick]).all(-1).any()
+    healed = step(engine(name), maze, state, ctrl)  # nothing of it stays in the engine
+    jax.tree.map(np.testing.assert_array_equal, clean, healed)
+
+
+def test_engine_names(engine):
+    assert make_engine("auto", POINT).name == ("mujoco" if jax.default_backend() == "cpu" else "mjx")
+    assert [engine(name).name for name in ("mjx", "mujoco")] == ["mjx", "mujoco"]
+    with pytest.raises(UserError) as refusal:
+        make_engine("bullet", POINT)
+    assert not [name for name in ENGINES if name not in str(refusal.value)]
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_control_step_is_the_robots(engine):
+    for name in ("mjx", "mujoco"):
+        seconds = engine(name).n_substeps * engine(name).model.opt.timestep
+        assert seconds == pytest.approx(POINT.control_dt_s)
+
+
+# ------------------------------------------------------------------------------------------------------ walls
+
+
+@given(st.integers(0, 2**31 - 1), st.sampled_from([2.2, 4.0, 7.0]))
+@settings(max_examples=30)
+def test_no_wall_that_could_be_touched_is_missing(seed, cell_m):
+    """Every wall within reach of a robot in a free cell is among the boxes, and every box is on a wall."""
+    walls = random_walls(seed, height=12, width=12, density=0.6)
+    maze = make_maze(walls, cell_m=cell_m)
+    rng = np.random.default_rng(seed)
+    free = np.argwhere(~walls)
+    points = np.float32((free[rng.integers(len(free), size=128)][:, ::-1] + rng.random((128, 2))) * cell_m)
+    reach = POINT.touch_m + POINT.top_speed_mps * POINT.control_dt_s
+    boxes = np.asarray(boxes_at(maze, points))
+    for row, column in np.argwhere(walls):
+        centre = (np.array([column, row]) + 0.5) * cell_m
+        beyond = np.maximum(np.abs(points - centre) - cell_m / 2, 0.0)
+        touchable = np.hypot(*beyond.T) < reach - 1e-4
+        there = (np.abs(boxes[..., :2] - centre).max(-1) < 1e-3) & (boxes[..., 2] > 0)
+        assert there.any(-1)[touchable].all()
+    up = boxes[boxes[..., 2] > 0]
+    row, column = np.floor(up[:, 1] / cell_m).astype(int), np.floor(up[:, 0] / cell_m).astype(int)
+    assert walls[row, column].all()
+    assert (boxes[..., 2][boxes[..., 2] <= 0] < -100).all()
+
+
+def test_moved_boxes_equal_a_model_with_every_wall_built_in(engine, wall_distance):
+    """One step each from the same state, along random drives by the walls; and then the drives as a whole.
+
+    A step differs by the rounding of its state to float32, 4e-6 m at 40 m. Drives part where a robot meets a
+    corner head on: there alone a rounding decides.
+    """
+    length, substeps = 300, engine("mujoco").n_substeps
+    model = static_model(POINT, LARGE.tobytes(), *LARGE.shape)
+    assert model.ngeom == LARGE.sum() + build_model(POINT).ngeom - build_model(POINT).nmocap
+    batch = Batch(model, nsim=N, nthread=1)
+    names = ("qpos", "qvel", "qacc_warmstart", "ctrl")
+    truth = {name: batch.bind(name) for name in names}
+    maze, ctrls = make_maze(LARGE), pushes(5, length)
+    state = starts(5, LARGE, wall_distance, speed=3.0)
+    whole = np.asarray(drive(engine("mujoco"), maze, state, ctrls).qpos)
+    for name in names[:3]:
+        truth[name][:] = np.asarray(getattr(state, name))
+    path, contacts = [], 0
+    for ctrl in ctrls:
+        now = PhysicsState(*(jnp.asarray(truth[name], jnp.float32) for name in names[:3]))
+        moved = step(engine("mujoco"), maze, now, ctrl)
+        truth["ctrl"][:] = np.asarray(ctrl)
+        batch.step(nstep=substeps)
+        np.testing.assert_allclose(moved.qpos, truth["qpos"], atol=2e-5)
+        np.testing.assert_allclose(moved.qvel, truth["qvel"], atol=1e-4)
+        path.append(truth["qpos"].copy())
+        contacts += (wall_distance(LARGE, path[-1]) < 0.5).sum()
+    assert contacts > 0.2 * length * N
+    apart = np.abs(np.stack(path) - whole).max((0, 2))
+    assert np.median(apart) < 1e-3 and (apart < 1e-2).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["antmaze-large", "hall", "unseen-rooms"])
+def test_no_speed_carries_the_point_through_a_wall(engine, wall_distance, name):
+    """Full throttle along both axes, from starts by the walls and at top speed: walls give by centimetres."""
+    walls = load_walls(name)
+    maze = load_maze(name)
+    diagonal = jnp.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)
+    for seed in range(4):
+        state = starts(seed, walls, wall_distance, speed=POINT.top_speed_mps)
+        direction = diagonal[np.random.default_rng(seed).integers(len(diagonal), size=N)]
+        after = drive(engine("mujoco"), maze, state, jnp.broadcast_to(direction, (60, N, 2)))
+        position = np.concatenate([np.asarray(state.qpos)[None], np.asarray(after.qpos)])
+        assert wall_distance(walls, position).min() > 0.35  # so the centre is never inside one
+        moved = np.linalg.norm(np.diff(position, axis=0), axis=-1)
+        assert moved.max() <= POINT.top_speed_mps * POINT.control_dt_s + 1e-4
+        assert (wall_distance(walls, position[-1]) < 0.52).mean() > 0.5  # the walls were reached
+
+
+def test_cells_too_small_for_three_boxes_are_refused():
+    for robot in (POINT, dataclasses.replace(POINT, touch_m=0.53), dataclasses.replace(POINT, top_speed_mps=9.1)):
+        least = 2 * (robot.touch_m + robot.top_speed_mps * robot.control_dt_s)
+        with pytest.raises(UserError) as refusal:
+            build_model(robot, cell_m=0.98 * least)
+        message = str(refusal.value)
+        assert robot.name in message and "\n" not in message
+        enough = float(message.split("at least ")[1].removesuffix(" m"))
+        assert least <= enough + 1e-9 and enough < least + 0.11
+        build_model(robot, cell_m=enough)  # the mend is a mend
+
+
+def test_the_point_is_what_its_data_say():
+    model = mujoco.MjModel.from_xml_string(model_xml(POINT))
+    assert model.geom("ball").size[0] == POINT.radius_m == POINT.touch_m
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1.0
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qvel, 4.0, rtol=0.01)  # the motors against the drag
+    assert np.linalg.norm(data.qvel) < POINT.top_speed_mps

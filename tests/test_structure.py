@@ -1,0 +1,164 @@
+"""What the sources themselves must keep to: imports go one way, functions are short, nothing is unpickled."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
+ORDER = [
+    *["interrupts", "checkpoint", "progress"],
+    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
+    *["transformer", "value", "fit", "policy", "evaluate", "finetune"],
+    *["baselines", "transfer", "presets", "model", "run"],
+    *["report", "pipeline", "cli"],
+]
+USERS = {"experiments", "benchmarks", "tests"}  # of the packages: no package knows of them
+LEARNING = {"optax", "orbax", "flax.linen", "flax.nnx", "flax.training", "brax.training", "tensorboardX"}
+PICKLERS = {"pickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "brax.io.model"}
+LONGEST = 80  # lines of a function
+
+
+def sources(folder: str) -> dict[str, Path]:
+    """Files of a folder by the name they are imported by; a package's ``__init__`` bears the package's."""
+    top = ROOT / ("envs" if folder == "ct_envs" else "")
+    files = sorted((top / folder).rglob("*.py"))
+    return {".".join(file.relative_to(top).with_suffix("").parts).removesuffix(".__init__"): file for file in files}
+
+
+PACKAGES = sources("ct_envs") | sources("ct_jax")
+SHIPPED = PACKAGES | sources("experiments") | sources("benchmarks")
+
+
+def imports(text: str, module: str, *, package: bool = False) -> Iterator[str]:
+    """Everything imported anywhere in a source, with the names taken: "ct_jax.prm.Roadmap"."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = module.split(".")
+            above = parts[: len(parts) - node.level + package] if node.level else []
+            yield from (".".join([*above, *filter(None, [node.module]), alias.name]) for alias in node.names)
+
+
+def imports_of(module: str) -> set[str]:
+    file = SHIPPED[module]
+    return set(imports(file.read_text("utf-8"), module, package=file.name == "__init__.py"))
+
+
+def within(name: str, modules: set[str]) -> bool:
+    """Whether a dotted name is one of the modules, or inside one."""
+    return any(name == module or name.startswith(module + ".") for module in modules)
+
+
+def rank(module: str) -> int:
+    """Place of a module of ct_jax in the order; -1 for the package itself."""
+    stage = [*module.split("."), ""][1]
+    return ORDER.index(stage) if stage else -1
+
+
+def later_stages(text: str, module: str, *, package: bool = False) -> list[str]:
+    """Imports of ct_jax that a module of it must not make."""
+    names = [name for name in imports(text, module, package=package) if within(name, {"ct_jax"})]
+    stages = [name for name in names if name.split(".")[1:2] and name.split(".")[1] in ORDER]
+    return [name for name in stages if rank(name) > rank(module)]
+
+
+def long_functions(text: str) -> list[str]:
+    functions = (n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+    return [node.name for node in functions if (node.end_lineno or 0) - node.lineno + 1 > LONGEST]
+
+
+def unpicklings(text: str, module: str = "") -> list[str]:
+    """Imports of picklers, and calls that would let NumPy unpickle."""
+    calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
+    keywords = (keyword for call in calls for keyword in call.keywords if keyword.arg == "allow_pickle")
+    allowed = [k.arg for k in keywords if not (isinstance(k.value, ast.Constant) and k.value.value is False)]
+    return [name for name in imports(text, module) if within(name, PICKLERS)] + [str(name) for name in allowed]
+
+
+# -------------------------------------------------------------------------------------------------- the rules
+
+
+def test_the_sources_were_found():
+    assert {"ct_envs", "ct_envs.maze", "ct_jax", "ct_jax.prm", "ct_jax.controllers.sac"} <= set(PACKAGES)
+
+
+@pytest.mark.parametrize("module", PACKAGES)
+def test_packages_know_nothing_of_their_users(module):
+    below = {"ct_jax"} if module.startswith("ct_envs") else set()
+    assert not [name for name in imports_of(module) if within(name, USERS | below)]
+
+
+@pytest.mark.parametrize("module", sources("ct_envs"))
+def test_worlds_know_nothing_of_learning(module):
+    assert not [name for name in imports_of(module) if within(name, LEARNING)]
+
+
+@pytest.mark.parametrize("module", sources("ct_jax"))
+def test_stages_import_earlier_ones_only(module):
+    stage = [*module.split("."), ""][1]
+    assert not stage or stage in ORDER, f"give {stage} its place in ORDER"
+    file = SHIPPED[module]
+    text = file.read_text("utf-8")
+    assert not later_stages(text, module, package=file.name == "__init__.py")
+
+
+@pytest.mark.parametrize("module", SHIPPED)
+def test_no_function_is_long(module):
+    assert not long_functions(SHIPPED[module].read_text("utf-8"))
+
+
+@pytest.mark.parametrize("module", SHIPPED)
+def test_nothing_is_unpickled(module):
+    assert not unpicklings(SHIPPED[module].read_text("utf-8"), module)
+
+
+# -------------------------------------------------------------------------------- and that they can be broken
+
+
+@pytest.mark.parametrize(
+    ("text", "module", "found"),
+    [
+        ("from ct_jax.collect import collect", "ct_jax.prm", ["ct_jax.collect.collect"]),
+        ("import ct_jax.cli", "ct_jax.report.page", ["ct_jax.cli"]),
+        ("from ct_jax import pipeline, __version__", "ct_jax.fit", ["ct_jax.pipeline"]),
+        ("def f():\n    from ..fit import fit", "ct_jax.controllers.sac", ["ct_jax.fit.fit"]),
+        ("from . import evaluate", "ct_jax.policy", ["ct_jax.evaluate"]),
+        ("from ct_jax.prm import Roadmap", "ct_jax", ["ct_jax.prm.Roadmap"]),
+        ("from ct_jax.prm import Roadmap\nimport ct_envs", "ct_jax.collect", []),
+        ("from ct_jax.report.page import page", "ct_jax.report.words", []),
+        ("from .sac import Sac", "ct_jax.controllers.differential_drive", []),
+    ],
+)
+def test_a_wrong_import_is_found(text, module, found):
+    assert later_stages(text, module) == found
+
+
+def test_relative_imports_of_a_package_start_at_itself():
+    assert list(imports("from .page import page", "ct_jax.report", package=True)) == ["ct_jax.report.page.page"]
+    assert list(imports("from .page import page", "ct_jax.report.words")) == ["ct_jax.report.page.page"]
+
+
+def test_a_long_function_is_found():
+    body = "    x = 1\n"
+    assert long_functions("def short():\n" + (LONGEST - 1) * body) == []
+    assert long_functions("class A:\n  def long():\n" + LONGEST * body) == ["long"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "def f():\n    import dill as d",
+        "from brax.io import model",
+        "np.load(file, allow_pickle=True)",
+        "np.load(file, allow_pickle=flag)",
+    ],
+)
+def test_an_unpickling_is_found(text):
+    assert unpicklings(text)
+    assert not unpicklings("import numpy as np\nnp.load(file, allow_pickle=False)")
