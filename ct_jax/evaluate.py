@@ -84,6 +84,9 @@ def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: f
     table = extend(build_roadmap(jax.random.key(seed), maze, radius_m=radius_m, config=dense), _join(start, goal)).table
     row = np.arange(len(start))
     shortest = np.asarray(table.distance)[dense.samples + 2 * row, dense.samples + 2 * row + 1]
+    straight = np.linalg.norm(start - goal, axis=1)
+    # In a very large maze the samples may not join a pair; a lower bound keeps its SPL a number, and strict.
+    shortest = np.where(np.isfinite(shortest), shortest, straight)
     return Pairs(start, goal, shortest, seed)
 
 

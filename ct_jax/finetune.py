@@ -17,7 +17,7 @@ from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, r
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action, Controller, Guided
-from ct_jax.trajectories import Trajectories, concatenate, select
+from ct_jax.trajectories import PER_STEP, Trajectories, concatenate, select
 
 KEEP = ("separate", "joined", "relabelled")
 
@@ -31,7 +31,9 @@ class RecoverConfig:
     stuck_m: float = 4.0  # ... the robot moved less than this [m]
     patience: int = 200  # failure: not at the goal after so many steps
     takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
-    keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
+    keep: str = (
+        "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
+    )
     # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
     give_up: float = 20.0  # stop after this many times T episodes
 
@@ -67,7 +69,9 @@ class Supervised:
         position = state.info["position"]
         rescued = memory.rescued | self._failed(memory, position)
         rescued |= jax.random.bernoulli(chance_key, self.config.takeover, rescued.shape)
-        action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
+        action = jax.tree.map(
+            lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own
+        )
         if self.config.keep == "relabelled":
             action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape))
         else:
@@ -116,7 +120,9 @@ def recover(
         first = episodes // collecting.reset_interval
         batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first)
         plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
+        memory = supervised.init(
+            batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan)
+        )
         state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
         data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
         rescued = np.asarray(state.info["success"]) > 0
@@ -134,12 +140,11 @@ def _split(data: Trajectories) -> list[Trajectories]:
     """Each trajectory as two: up to the failure, and the recovery from it."""
     learn = np.asarray(data.learn)
     begin = learn.argmax(1)
-    fail = data.replace(length=begin.astype(np.int32), learn=(np.arange(learn.shape[1]) < begin[:, None]) * 1.0)
+    fail = data.replace(
+        length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None])
+    )
     later = np.minimum(np.arange(learn.shape[1]) + begin[:, None], learn.shape[1] - 1)
     row = np.arange(data.n)[:, None]
-    moved = {name: np.asarray(getattr(data, name))[row, later] for name in _PER_STEP}
+    moved = {name: np.asarray(getattr(data, name))[row, later] for name in PER_STEP}
     recovery = replace(data, **moved, length=np.asarray(data.length) - begin)
     return [select(fail, begin > 0), recovery]
-
-
-_PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")

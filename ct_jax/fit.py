@@ -17,6 +17,7 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from ct_envs import UserError
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.trajectories import Trajectories, Window, pad, sample_windows, select
@@ -60,9 +61,10 @@ class FitState:
     update: jax.Array
 
 
-def data_mesh() -> Mesh:
-    """All devices along one axis, "data"."""
-    return jax.make_mesh((jax.device_count(),), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+def data_mesh(batch: int) -> Mesh:
+    """As many devices as share a batch evenly, along one axis, "data"."""
+    n = max(d for d in range(1, jax.device_count() + 1) if batch % d == 0)
+    return jax.make_mesh((n,), ("data",), axis_types=(jax.sharding.AxisType.Auto,), devices=jax.devices()[:n])
 
 
 Loss = Callable[[Any, Window, jax.Array], jax.Array]
@@ -74,26 +76,28 @@ class Fit:
     def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float):
         self.loss, self.config, self.map_cell_m = loss, config, map_cell_m
         if config.decay:
-            rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, config.warmup, config.updates)
+            rate = optax.warmup_cosine_decay_schedule(
+                0.0, config.learning_rate, config.warmup, max(config.updates, config.warmup + 1)
+            )
         else:
             rate = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
         self.optimizer = optax.chain(
             optax.clip_by_global_norm(config.clip),
             optax.adamw(rate, weight_decay=config.weight_decay, mask=_matrices),
         )
-        self._mesh = data_mesh()
+        self.mesh = data_mesh(config.batch)
         self.train = jax.jit(self._train, static_argnames="updates")
 
     def create(self, key: jax.Array, params: Any) -> FitState:
         """The state before training, replicated over the devices."""
         state = FitState(params, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
-        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self._mesh, PartitionSpec()))
+        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self.mesh, PartitionSpec()))
 
     def _train(
         self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze, updates: int
     ) -> tuple[FitState, jax.Array]:
         """Run some updates (static); returns the mean loss over them."""
-        shard = NamedSharding(self._mesh, PartitionSpec("data"))
+        shard = NamedSharding(self.mesh, PartitionSpec("data"))
 
         def update(state: FitState, _) -> tuple[FitState, jax.Array]:
             draw, drop = jax.random.split(jax.random.fold_in(state.key, state.update))
@@ -156,10 +160,17 @@ def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: 
 
 
 def best_trajectories(data: Trajectories, config: ValueConfig) -> Trajectories:
-    """The trajectories that the value network learns from: whole successes, the top X %, collision-free on demand."""
+    """The trajectories that the value network learns from: the top X %, collision-free on demand.
+
+    Raises:
+        UserError: none is without a collision.
+    """
     keep = np.ones(data.n, bool)
     if config.collision_free:
-        keep &= np.asarray(data.collision).sum(1) == 0
+        inside = np.arange(data.collision.shape[1]) < np.asarray(data.length)[:, None]
+        keep &= ~((np.asarray(data.collision) > 0) & inside).any(1)
+        if not keep.any():
+            raise UserError("every trajectory has a collision: give the roadmap a margin, or set collision_free to false")
     if config.top < 1.0:
         straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
         score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
@@ -178,7 +189,7 @@ def fit(
     checkpoints: Checkpoints | None = None,
     chunk: int = 20,
 ) -> Any:
-    """Train to the configured number of updates; returns the parameters.
+    """Train to the configured number of updates; returns the parameters, on the host.
 
     Args:
         on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
@@ -189,7 +200,7 @@ def fit(
         state = found[1]
     # A dataset that grows from round to round compiles anew only when it outgrows these.
     data = pad(data, -(-data.n // 1024) * 1024, -(-data.position.shape[1] // 256) * 256)
-    place = functools.partial(jax.device_put, device=NamedSharding(data_mesh(), PartitionSpec()))
+    place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
     done = int(state.update)
     try:
@@ -203,5 +214,5 @@ def fit(
         if checkpoints is not None:
             checkpoints.save(done, state)
         raise
-    return state.params
+    return jax.device_get(state.params)
 

@@ -45,19 +45,20 @@ PUBLISHED = replace(
 )
 """The method as published in everything but size: a model, a memory and a number of updates for two CPU cores."""
 
-_LIFTED = FitConfig(batch=40, steps=48, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True)
+_LIFTED = FitConfig(batch=24, steps=80, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True)
 
 CPU = replace(
     PUBLISHED,
     prm=PrmConfig(margin_m=0.3),
     collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
-    model=replace(PUBLISHED.model, dropout=0.0),
+    model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0),
     fit=replace(_LIFTED, updates=800),
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
-    recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=150),
-    rounds=8,
+    recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=250),
+    rounds=10,
+    reprompt=True,
     round_fit=replace(_LIFTED, updates=300, warmup=20),
-    last_fit=replace(_LIFTED, updates=1500, warmup=20, decay=True),
+    last_fit=replace(_LIFTED, updates=2500, warmup=20, decay=True),
 )
 """What lifts the method on two CPU cores: a teacher that knows no more than its pupil, free starts, disturbances,
 mirrored worlds, and recoveries in which the planner's action is imitated at every step."""

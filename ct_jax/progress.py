@@ -81,13 +81,14 @@ class Metrics:
         self._begun = time.monotonic()
 
     def log(self, stage: str, step: int, **values: float) -> None:
-        """Log the scalars of a stage at a step. What is not finite is null in the file: JSON knows no other way."""
+        """Log the scalars of a stage at a step. What is not finite is null: JSON knows no other way."""
         record: dict[str, str | float | None] = {"stage": stage, "step": step}
         record["time_s"] = round(time.monotonic() - self._begun, 3)
-        record |= {name: value if math.isfinite(value) else None for name, value in values.items()}
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        record |= dict.fromkeys(values) | finite
         self._file.write(json.dumps(record) + "\n")
         self._file.flush()
-        for name, value in values.items():
+        for name, value in finite.items():
             self._board.add_scalar(f"{stage}/{name}", value, step)
 
     def close(self) -> None:

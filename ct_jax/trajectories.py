@@ -21,7 +21,7 @@ from ct_envs.occupancy import local_map
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 
 
-_PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
+PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
 
 
 @struct.dataclass
@@ -72,7 +72,7 @@ def pad(trajectories: Trajectories, n: int, steps: int) -> Trajectories:
 
     def fit(name: str) -> np.ndarray:
         leaf = np.asarray(getattr(trajectories, name))
-        if name in _PER_STEP:
+        if name in PER_STEP:
             leaf = leaf[:, :steps]
             leaf = np.pad(leaf, [(0, 0), (0, steps - leaf.shape[1])] + [(0, 0)] * (leaf.ndim - 2))
         return np.pad(leaf, [(0, n - leaf.shape[0])] + [(0, 0)] * (leaf.ndim - 1))

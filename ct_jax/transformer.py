@@ -35,13 +35,19 @@ class ModelConfig:
     returns: bool = True  # condition on returns; without them this is BC-CT
 
 
+_NEVER = -(10**6)  # the step of a token that is not there
+
+
 @struct.dataclass
 class Cache:
-    """Keys and values of the last steps of N episodes: a ring over ``slots`` steps of three tokens."""
+    """Keys and values of the last steps of N episodes, a ring of K + 1 places for the tokens a_{t-1}, R_t, s_t.
 
-    keys: Float[Array, "L N slots3 H D"]
-    values: Float[Array, "L N slots3 H D"]
-    step: Int[Array, "N slots3"]  # step of the token in each place; very negative where there is none
+    One place more than K: the last action still sees K steps back from its own.
+    """
+
+    keys: tuple[Float[Array, "N P H D"], ...]  # one array a layer
+    values: tuple[Float[Array, "N P H D"], ...]
+    step: Int[Array, "P"]  # step of each token
     now: Int[Array, ""]  # steps taken
     action: Float[Array, "N A"]  # last action
 
@@ -171,27 +177,26 @@ class ControlTransformer(nn.Module):
     ) -> tuple[Float[Array, "N A"], Cache]:
         """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
         t = cache.now
-        new = [self.embed_action(cache.action), self._embed_return(rtg), self._embed_state(maps, proprio, goal)]
-        step_of = jnp.array([t - 1, t, t])
-        x = self.norm_in(jnp.stack(new, 1) + self._embed_time(step_of)[None])
-        slots = cache.step.shape[1] // TOKENS
-        place = jnp.array([(t - 1) % slots * TOKENS + 2, t % slots * TOKENS, t % slots * TOKENS + 1])
-        # The first step has no action before it: its token is kept out of sight by a step that no query reaches.
-        seen_as = jnp.where(step_of < 0, -(10**6), step_of)
-        # The place of this step's action still holds one of a step long gone: out of the band, so out of sight.
-        step = cache.step.at[:, place].set(seen_as)
-        mask = band(step_of, step[0], self.config.context_acting)
-        order = jnp.array([0, 1, 2])
-        stored = jnp.full(slots * TOKENS, -1).at[place].set(order)
-        mask = mask & (stored[None, :] <= order[:, None]) | (stored[None, :] == order[:, None])
+        before = self.embed_action(cache.action) + self._embed_time(t - 1)[None]
+        now = self._embed_time(t)[None]
+        x = jnp.stack([before, self._embed_return(rtg) + now, self._embed_state(maps, proprio, goal) + now], 1)
+        x = self.norm_in(x)
+        # The first step has no action before it: its token is said to be of a step that no query reaches.
+        step_of = jnp.array([jnp.where(t > 0, t - 1, _NEVER), t, t])
+        place = t % (cache.step.shape[0] // TOKENS) * TOKENS
+        step = jax.lax.dynamic_update_slice(cache.step, step_of, (place,))
+        order = jnp.arange(TOKENS)
+        later = jnp.zeros_like(step).at[place + order].set(order)  # of the new tokens, none sees a later one
+        mask = band(step_of, step, self.config.context_acting) & (later[None, :] <= order[:, None])
         mask = jnp.broadcast_to(mask, (x.shape[0], *mask.shape))
-        keys, values = cache.keys, cache.values
-        for i, block in enumerate(self.blocks):
+        keys, values = [], []
+        for block, old_keys, old_values in zip(self.blocks, cache.keys, cache.values, strict=True):
             q, k, v = block.heads(x)
-            keys, values = keys.at[i, :, place].set(jnp.swapaxes(k, 0, 1)), values.at[i, :, place].set(jnp.swapaxes(v, 0, 1))
-            x = block.attend(x, q, keys[i], values[i], mask, True)
+            keys.append(jax.lax.dynamic_update_slice(old_keys, k, (0, place, 0, 0)))
+            values.append(jax.lax.dynamic_update_slice(old_values, v, (0, place, 0, 0)))
+            x = block.attend(x, q, keys[-1], values[-1], mask, True)
         action = jnp.clip(self.predict_action(self.norm_out(x[:, 2])), -1.0, 1.0)
-        return action, Cache(keys, values, step, t + 1, action)
+        return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
 
 
 def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
@@ -201,13 +206,13 @@ def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Arr
 
 
 def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
-    """The cache before the first step of N episodes. One step more than K: the last action still sees K back."""
+    """The cache before the first step of N episodes."""
     places = TOKENS * (config.context_acting + 1)
-    shape = (config.layers, n, places, config.heads, config.width // config.heads)
+    empty = jnp.zeros((n, places, config.heads, config.width // config.heads))
     return Cache(
-        keys=jnp.zeros(shape),
-        values=jnp.zeros(shape),
-        step=jnp.full((n, places), -(10**6), jnp.int32),
+        keys=(empty,) * config.layers,
+        values=(empty,) * config.layers,
+        step=jnp.full(places, _NEVER, jnp.int32),
         now=jnp.zeros((), jnp.int32),
         action=jnp.zeros((n, action_size)),
     )

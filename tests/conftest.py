@@ -3,6 +3,9 @@
 jax and numpy read the environment variables once, when first imported, so they are set above those imports.
 """
 
+import contextlib
+import dataclasses
+import io
 import os
 from pathlib import Path
 
@@ -119,3 +122,82 @@ def toy_data():
         )
 
     return make
+
+
+ISLANDS = """\
+#########
+#...#...#
+#...#...#
+#########
+"""  # two regions: nobody can be asked to go from one to the other
+
+
+@dataclasses.dataclass(frozen=True)
+class TinyRun:
+    """A finished run through the command line: what it was given, wrote and said. Copy the folder to change it."""
+
+    folder: Path
+    arguments: list[str]
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture(scope="session")
+def tiny_settings():
+    """Settings of a run that takes seconds and learns nothing; every stage is there."""
+    from ct_jax import presets as p
+
+    fit = p.FitConfig(updates=40, batch=4, steps=8)
+    return p.Settings(
+        prm=p.PrmConfig(samples=40),
+        sac=p.SacConfig(
+            envs=4, iterations=50, updates=1, warmup=2, batch=8, hidden=(8,), replay=200, episode_steps=5
+        ),
+        collect=p.CollectConfig(
+            trajectories=2, envs=8, horizon=50, reset_interval=8, starts="maze", guide="explorer", give_up=1000
+        ),
+        model=p.ModelConfig(layers=1, heads=2, width=16, context=4, context_acting=4),
+        value=p.ValueConfig(fit=dataclasses.replace(fit, steps=1), width=16),
+        fit=fit,
+        recover=p.RecoverConfig(recoveries=1, patience=10, stuck_steps=5, keep="relabelled", give_up=1000),
+        rounds=1,
+        episodes=4,
+    )
+
+
+@pytest.fixture
+def tiny(monkeypatch, tiny_settings):
+    """Lets the command line know of a preset "tiny", with short episodes, and leaves jax as the tests have it."""
+    _know_tiny(monkeypatch, tiny_settings)
+
+
+def _know_tiny(patch: pytest.MonkeyPatch, settings) -> None:
+    from ct_envs import robots
+    from ct_jax import cli, presets
+
+    patch.setitem(robots.ROBOTS, "point", dataclasses.replace(robots.POINT, horizon=50))
+    patch.setitem(presets.PRESETS, "tiny", settings)
+    patch.setattr(cli, "prepare_jax", lambda: None)
+
+
+@pytest.fixture(scope="session")
+def islands(tmp_path_factory):
+    """A maze file of two separate regions."""
+    file = tmp_path_factory.mktemp("mazes") / "islands.txt"
+    file.write_text(ISLANDS)
+    return file
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory, tiny_settings, islands):
+    """A run that nothing interrupted. Whoever asks for it needs ``rank_promotion("allow")``."""
+    from ct_jax.cli import main
+
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    arguments = ["train", "point", "--preset", "tiny", "--maze", str(islands), "--eval-maze", "antmaze-umaze"]
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        _know_tiny(patch, tiny_settings)
+        status = main([*arguments, "--out", str(folder)])
+    assert status == 0, err.getvalue()
+    return TinyRun(folder, arguments, out.getvalue(), err.getvalue())

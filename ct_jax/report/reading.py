@@ -1,0 +1,230 @@
+"""Reading a run folder: what is there, as arrays and plain values; what is missing or torn, as nothing."""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ct_envs.errors import UserError
+from ct_envs.maze import CELL_M, parse_walls
+
+STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate")
+METHODS = ("ct", "planner", "explorer")  # the order they are shown in; others follow
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What one method did in one maze."""
+
+    maze: str
+    method: str
+    seen: bool
+    path: Float[np.ndarray, "T n 2"]  # [m]
+    success: Bool[np.ndarray, "n"]
+    collided: Bool[np.ndarray, "n"]
+    steps: Int[np.ndarray, "n"]
+    start: Float[np.ndarray, "n 2"]
+    goal: Float[np.ndarray, "n 2"]
+    returns: Float[np.ndarray, "n"] | None
+    asked: Float[np.ndarray, "n"] | None  # return asked for at the start
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One scalar of one stage."""
+
+    step: np.ndarray
+    value: np.ndarray
+
+
+@dataclass(frozen=True)
+class Run:
+    """All that a report shows. Empty where a stage is missing."""
+
+    folder: Path
+    config: dict[str, Any]
+    cell_m: float
+    walls: dict[str, Bool[np.ndarray, "H W"]]  # the training mazes first
+    seen: dict[str, bool]
+    rows: list[dict[str, Any]]  # of evaluate/results.json, seen mazes first, methods in order
+    episodes: list[Episodes]  # likewise
+    curves: dict[str, dict[str, Curve]]  # by stage and name
+    horizon: int  # steps of the longest episode: when time runs out
+    roadmap: tuple[np.ndarray, np.ndarray] | None  # points [n, 2] (m), edges [m, 2]
+    done: dict[str, dict[str, Any]]  # by stage
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run folder.
+
+    Raises:
+        UserError: there is no folder, or no readable config.json in it.
+    """
+    config = _read_config(folder)
+    seen_mazes, unseen_mazes = _texts(config.get("mazes")), _texts(config.get("eval_mazes"))
+    walls = dict(_walls(seen_mazes | unseen_mazes))
+    seen = dict.fromkeys(unseen_mazes, False) | dict.fromkeys(seen_mazes, True)
+    rows = _read_rows(folder / "evaluate" / "results.json")
+    seen = {row["maze"]: bool(row.get("seen")) for row in rows} | seen
+    cell_m = number(config.get("cell_m"))
+    episodes = list(_read_episodes(folder / "evaluate", rows, seen))
+    return Run(
+        folder=folder,
+        config=config,
+        cell_m=cell_m if cell_m and cell_m > 0 else CELL_M,
+        walls=walls,
+        seen=seen,
+        rows=rows,
+        episodes=episodes,
+        horizon=max((int(e.steps.max()) for e in episodes), default=0),
+        curves=_read_curves(folder / "metrics.jsonl"),
+        roadmap=_read_roadmap(folder / "prm" / "roadmap.npz"),
+        done={s: done for s in STAGES if isinstance(done := read_json(folder / s / "done.json"), dict)},
+    )
+
+
+def number(value: Any) -> float | None:
+    """A finite number, or nothing."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
+    return None
+
+
+def slug(name: str) -> str:
+    """The part of a file name that stands for a maze or method."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds, or None if it is missing or half-written."""
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    if not path.is_file():
+        what = "has no config.json, so it is no run folder" if folder.is_dir() else "is no folder"
+        raise UserError(f"{folder}: {what}; give the folder that `ct-jax train ... --out` wrote")
+    config = read_json(path)
+    if not isinstance(config, dict):
+        raise UserError(f"{path}: not a readable JSON object; run the training again, or restore the file")
+    return config
+
+
+def _texts(mapping: Any) -> dict[str, str]:
+    return {str(k): v for k, v in mapping.items() if isinstance(v, str)} if isinstance(mapping, dict) else {}
+
+
+def _walls(texts: dict[str, str]) -> Iterator[tuple[str, np.ndarray]]:
+    """The wall grids of mazes that can be read."""
+    for name, text in texts.items():
+        try:
+            yield name, parse_walls(text, source="maze")
+        except UserError:
+            continue
+
+
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    found = read_json(path)
+    rows = found.get("rows") if isinstance(found, dict) else None
+    rows = rows if isinstance(rows, list) else []
+    rows = [row | {"maze": str(row["maze"]), "method": str(row["method"])} for row in rows if _is_row(row)]
+    order = [*METHODS, *dict.fromkeys(row["method"] for row in rows)]
+    mazes = list(dict.fromkeys(row["maze"] for row in rows))
+    return sorted(rows, key=lambda r: (not r.get("seen"), mazes.index(r["maze"]), order.index(r["method"])))
+
+
+def _is_row(row: Any) -> bool:
+    return isinstance(row, dict) and "maze" in row and "method" in row
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an archive, or none if it is missing or half-written."""
+    if not path.is_file():
+        return {}
+    try:
+        # opened here, for NumPy leaves the file of a torn archive open
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception:  # a torn archive fails in a dozen ways, all of which mean the same here
+        return {}
+
+
+def _read_roadmap(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    arrays = _read_arrays(path)
+    points, edges = arrays.get("points"), arrays.get("edges")
+    if points is None or edges is None or points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+        return None
+    edges = edges.reshape(-1, 2).astype(int)
+    inside = len(edges) == 0 or (edges.min() >= 0 and edges.max() < len(points))
+    return (points, edges) if inside else None
+
+
+def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, bool]) -> Iterator[Episodes]:
+    methods = dict.fromkeys((*METHODS, *(row["method"] for row in rows)))
+    for maze, method in product(sorted(seen, key=lambda name: not seen[name]), methods):
+        arrays = _read_arrays(folder / f"{slug(maze)}-{slug(method)}.npz")
+        path, success = arrays.get("path"), arrays.get("success")
+        if path is None or success is None or path.ndim != 3 or path.shape[2] != 2 or not path.size:
+            continue
+        n = path.shape[1]
+        wanted = {"success": (n,), "steps": (n,), "start": (n, 2), "goal": (n, 2)}
+        if any(name not in arrays or arrays[name].shape != shape for name, shape in wanted.items()):
+            continue
+        collided = arrays.get("collided")
+        yield Episodes(
+            maze=maze,
+            method=method,
+            seen=seen[maze],
+            path=path,
+            success=success.astype(bool),
+            collided=np.zeros(n, bool) if collided is None or collided.shape != (n,) else collided.astype(bool),
+            steps=np.clip(arrays["steps"].astype(int), 0, len(path)),
+            start=arrays["start"],
+            goal=arrays["goal"],
+            returns=_optional(arrays, "returns", n),
+            asked=_optional(arrays, "asked", n),
+        )
+
+
+def _optional(arrays: dict[str, np.ndarray], name: str, n: int) -> np.ndarray | None:
+    values = arrays.get(name)
+    if values is None or values.shape != (n,) or not np.isfinite(values).all():
+        return None
+    return values.astype(float)
+
+
+def _read_curves(path: Path) -> dict[str, dict[str, Curve]]:
+    """Scalars by stage and name; a step run again after a resume counts once. Bad lines are left out."""
+    points: dict[str, dict[str, dict[float, float]]] = {}
+    try:
+        lines = path.read_text("utf-8", errors="replace").splitlines()
+    except OSError:
+        return {}
+    for line in lines:
+        try:
+            record = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if not isinstance(record, dict) or (step := number(record.get("step"))) is None:
+            continue
+        stage = points.setdefault(str(record.get("stage", "training")), {})
+        for name, value in record.items():
+            if name not in ("stage", "step") and (scalar := number(value)) is not None:
+                stage.setdefault(name, {})[step] = scalar
+    return {stage: {name: _curve(p) for name, p in named.items()} for stage, named in points.items()}
+
+
+def _curve(points: dict[float, float]) -> Curve:
+    steps = sorted(points)
+    return Curve(np.array(steps), np.array([points[step] for step in steps]))

@@ -1,0 +1,189 @@
+"""Recoveries: the policy until it fails, the planner from then on, and each step taught by the right one."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from ct_envs import POINT, MazeEnv, UserError, load_maze, stack_mazes
+from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
+from ct_jax.finetune import RecoverConfig, Supervised, recover
+from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PrmConfig
+from ct_jax.rollout import Guided, act_as_meant
+from ct_jax.trajectories import PER_STEP
+from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+from ct_jax.value import ValueNetwork
+
+pytestmark = pytest.mark.rank_promotion("allow")
+
+N = 8
+PRM = PrmConfig(samples=60)
+COLLECTING = CollectConfig(reset_interval=4, envs=N, starts="maze")
+CONFIG = RecoverConfig(recoveries=3, stuck_steps=5, stuck_m=1.0, patience=60, give_up=20.0)
+MAZES = stack_mazes([load_maze("antmaze-umaze")])
+ENV = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=250)
+
+
+@struct.dataclass
+class Blind:
+    """A policy that pushes straight for the goal, so that it succeeds or ends at a wall; or does nothing."""
+
+    controller: object
+
+    def init(self, state):
+        return ()
+
+    def act(self, memory, state, key):
+        return act_as_meant(self.controller(state.obs["proprio"], state.obs["goal"])), memory
+
+
+def recoveries(own, push, seed=0, *, gain=1.0, **options):
+    config = replace(CONFIG, **options)
+    return recover(jax.random.key(seed), ENV, MAZES, own, push(gain), config, COLLECTING, PRM)
+
+
+@pytest.fixture(scope="module")
+def joined(push):
+    return recoveries(Blind(push()), push, keep="joined")
+
+
+def begins(data) -> np.ndarray:
+    return np.asarray(data.learn).argmax(1)
+
+
+def test_joined_recoveries_teach_the_recovery_only(joined):
+    begin = begins(joined)
+    assert (begin >= CONFIG.stuck_steps).all()  # it takes so long to see that it is stuck
+    t = np.arange(joined.learn.shape[1])
+    np.testing.assert_array_equal(joined.learn, (t >= begin[:, None]) & (t < joined.length[:, None]))
+    last = joined.reward[np.arange(joined.n), joined.length - 1]
+    assert (last > -POINT.goal_tolerance_m).all()  # every one of them arrived
+
+
+def test_the_planner_takes_over_where_the_policy_is_stuck(joined):
+    """Not before: at the takeover the robot has moved less than the limit in so many steps, for the first time."""
+    w = CONFIG.stuck_steps
+    for i, begin in enumerate(begins(joined)):
+        position = joined.position[i, : joined.length[i]]
+        moved = np.linalg.norm(position[w:] - position[:-w], axis=-1)
+        stuck = np.flatnonzero(moved < CONFIG.stuck_m)
+        assert begin == min(stuck[0] + w, CONFIG.patience)
+
+
+def test_separate_recoveries_join_to_the_whole(joined, push):
+    pieces = recoveries(Blind(push()), push, keep="separate")
+    n = joined.n
+    assert pieces.n == 2 * n
+    np.testing.assert_array_equal(pieces.length[:n] + pieces.length[n:], joined.length)
+    np.testing.assert_array_equal(pieces.length[:n], begins(joined))
+    for i in range(n):
+        begin, end = pieces.length[i], joined.length[i]
+        for name in PER_STEP:
+            first, second = (getattr(pieces, name)[k, : pieces.length[k]] for k in (i, n + i))
+            if name == "learn":  # as trajectories of their own, both are imitated (paper)
+                assert first.all() and second.all()
+                continue
+            np.testing.assert_array_equal(first, getattr(joined, name)[i, :begin], err_msg=name)
+            np.testing.assert_array_equal(second, getattr(joined, name)[i, begin:end], err_msg=name)
+    np.testing.assert_array_equal(pieces.goal, np.tile(joined.goal, (2, 1)))
+    assert all(np.asarray(getattr(pieces, name)).dtype == np.float32 for name in PER_STEP)
+
+
+def test_a_policy_that_does_not_move_is_rescued_every_time(push):
+    data = recoveries(Blind(push(0.0)), push, keep="joined")
+    assert data.n >= N - 1  # all, but for a start at the goal
+    np.testing.assert_array_equal(begins(data), CONFIG.stuck_steps)
+
+
+def test_patience_ends(push):
+    """A slow policy that is never stuck by its measure is relieved when its time is over."""
+    data = recoveries(Blind(push(0.3)), push, keep="joined", patience=7, stuck_m=0.0)
+    np.testing.assert_array_equal(begins(data), 7)
+
+
+def test_the_planner_may_take_over_by_chance(push):
+    data = recoveries(Blind(push(0.0)), push, keep="separate", takeover=1.0)
+    assert data.n <= 2 * N and (data.learn.sum(1) == data.length).all()
+    assert len({tuple(goal) for goal in data.goal}) == data.n  # the failures before it have no steps: none is kept
+
+
+def supervised_walk(push, keep: str, steps: int = 12):
+    """Actions of a supervised policy beside those of the guide with the same memory."""
+    guide = make_guide("shortcut", ENV, PRM)
+    batch = draw_batch(jax.random.key(4), ENV, MAZES, COLLECTING, PRM)
+    plan = plan_memory(guide, batch.tables, batch.which, batch.state)
+    supervised = Supervised(Blind(push(0.2)), Guided(push(), guide), replace(CONFIG, keep=keep))
+    memory = supervised.init(batch.state, (), supervised.guided.init(batch.state, plan))
+
+    @jax.jit
+    def once(state, memory):
+        guided, _ = supervised.guided.act(memory.guided, state, jax.random.key(0))
+        own, _ = supervised.own.act((), state, jax.random.key(0))
+        action, after = supervised.act(memory, state, jax.random.key(0))
+        return jax.vmap(ENV.step)(state, action.done), after, (action, own, guided)
+
+    state, record = batch.state, []
+    for _ in range(steps):
+        state, memory, one = once(state, memory)
+        record.append((*one, np.asarray(memory.rescued)))
+    return record
+
+
+@pytest.mark.parametrize("keep", ["joined", "relabelled"])
+def test_who_acts_and_who_is_imitated(push, keep):
+    seen = set()
+    for action, own, guided, rescued in supervised_walk(push, keep):
+        who = np.where(rescued[:, None], guided.done, own.done)
+        np.testing.assert_array_equal(action.done, who)
+        np.testing.assert_array_equal(action.meant, who)
+        if keep == "relabelled":
+            np.testing.assert_array_equal(action.target, guided.target)
+            np.testing.assert_array_equal(action.learn, 1.0)
+        else:
+            np.testing.assert_array_equal(action.learn, rescued)
+            np.testing.assert_array_equal(np.asarray(action.target)[rescued], np.asarray(guided.target)[rescued])
+        seen |= set(rescued.tolist())
+    assert seen == {False, True}
+
+
+def test_relabelled_steps_all_teach(push):
+    data = recoveries(Blind(push(0.2)), push, keep="relabelled")
+    assert (data.learn.sum(1) == data.length).all()
+    inside = np.arange(data.learn.shape[1]) < data.length[:, None]
+    assert np.abs(data.target - data.action)[inside].max() > 0.5  # what was done is not what is taught
+    assert (np.abs(data.target[inside]) <= 1).all()
+
+
+def test_a_policy_that_never_fails_and_a_planner_that_never_saves_end(push):
+    options = {"recoveries": 2, "give_up": 8.0, "keep": "joined"}
+    with pytest.raises(UserError, match="no recovery in 16 episodes"):
+        recoveries(Blind(push(0.0)), push, gain=0.0, **options)
+    with pytest.raises(UserError, match="hardly fails"):
+        recoveries(Blind(push()), push, patience=10**6, stuck_m=0.0, **options)
+
+
+def test_without_compilation(push):
+    """A transformer under supervision, two steps, with everything on."""
+    config = ModelConfig(layers=1, heads=1, width=4, context=2, context_acting=2, max_timestep=8)
+    inputs = sample_inputs(2, 2)
+    own = TransformerPolicy(
+        jax.jit(ControlTransformer(config, 2).init)(jax.random.key(0), *inputs),
+        jax.jit(ValueNetwork(4).init)(jax.random.key(0), *inputs[:3]), config, 2, value_width=4,
+    )  # fmt: skip
+    env = MazeEnv(POINT, engine="mujoco", auto_reset=False)
+    guide = make_guide("explorer", env, PRM)
+    batch = draw_batch(jax.random.key(0), env, MAZES, replace(COLLECTING, envs=2), PrmConfig(samples=20))
+    supervised = Supervised(own, Guided(push(), guide, 0.1), replace(CONFIG, stuck_steps=1))
+    memory = supervised.init(batch.state, own.init(batch.state), supervised.guided.init(batch.state, guide.init(batch.state.info["maze"])))  # fmt: skip # noqa: E501
+    expected, _ = jax.jit(Supervised.act)(supervised, memory, batch.state, jax.random.key(1))
+    with jax.disable_jit():
+        action, after = supervised.act(memory, batch.state, jax.random.key(1))
+        assert not after.rescued.any()
+    np.testing.assert_allclose(action.done, expected.done, atol=1e-4)
+    _, after = jax.jit(Supervised.act)(supervised, after, batch.state, jax.random.key(2))
+    assert after.rescued.all()
+    assert jnp.isfinite(action.target).all()

@@ -1,0 +1,237 @@
+"""Supervised training: it learns, it can be stopped and continued, and it is one program on any number of devices."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ct_envs import UserError, load_maze, stack_mazes
+from ct_jax.checkpoint import Checkpoints
+from ct_jax.fit import (
+    Fit,
+    FitConfig,
+    ValueConfig,
+    best_trajectories,
+    fit,
+    init_params,
+    transformer_loss,
+    value_loss,
+)
+from ct_jax.trajectories import sample_windows, save
+from ct_jax.transformer import ControlTransformer, ModelConfig
+from ct_jax.value import ValueNetwork
+
+MAZES = stack_mazes([load_maze("antmaze-umaze")])
+CONFIG = FitConfig(updates=8, batch=4, steps=3, learning_rate=1e-2, warmup=2)
+MODEL = ControlTransformer(
+    ModelConfig(layers=1, heads=1, width=8, context=3, context_acting=3, dropout=0.2, max_timestep=32), 2
+)
+
+
+@pytest.fixture(scope="module")
+def data(toy_data):
+    data = toy_data([9, 17, 20], seed=1)
+    return data.replace(target=np.tanh(data.position - 10.0), proprio=data.position / 10.0)
+
+
+@pytest.fixture(scope="module")
+def learner():
+    """One for all, so that it compiles once."""
+    return Fit(transformer_loss(MODEL), CONFIG, 0.8)
+
+
+@pytest.fixture(scope="module")
+def params(data):
+    return init_params(jax.random.key(0), MODEL, data)
+
+
+def run(learner, params, data, seed=0, **options):
+    return fit(jax.random.key(seed), learner, params, data, MAZES, **{"chunk": 2} | options)
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+# ---------------------------------------------------------------------------------------------------------- learning
+
+
+def test_the_loss_falls(data, params):
+    losses = []
+    run(
+        Fit(transformer_loss(MODEL), replace(CONFIG, updates=120, batch=16), 0.8),
+        params,
+        data,
+        chunk=20,
+        on_progress=lambda update, loss: losses.append((update, loss)),
+    )
+    assert [update for update, _ in losses] == [20, 40, 60, 80, 100, 120]
+    assert losses[-1][1] < 0.5 * losses[0][1]
+
+
+def test_the_seed_decides(learner, params, data):
+    once, again, other = (run(learner, params, data, seed) for seed in (0, 0, 1))
+    assert same(once, again)
+    assert not same(once, other)
+
+
+def test_chunks_compile_once_and_change_nothing(data, params):
+    learner = Fit(transformer_loss(MODEL), CONFIG, 0.8)
+    by_two = run(learner, params, data, chunk=2)
+    assert learner.train._cache_size() == 1
+    by_four = run(learner, params, data, chunk=4)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), by_two, by_four)
+
+
+def test_the_rate_warms_up_from_zero(data, params):
+    learner = Fit(transformer_loss(MODEL), replace(CONFIG, warmup=4, weight_decay=0.0), 0.8)
+    state = learner.create(jax.random.key(0), params)
+    sizes = []
+    for _ in range(6):
+        after, _ = learner.train(state, data, data.rtg, MAZES, 1)
+        moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, state.params)
+        sizes.append(float(jnp.stack(jax.tree.leaves(moved)).max()))
+        state = after
+    assert sizes[0] == 0.0
+    # Adam's first moves are about as long as the rate
+    np.testing.assert_allclose(sizes[1], 0.25 * CONFIG.learning_rate, rtol=0.3)
+    assert 0 < sizes[1] < sizes[2] < 1.5 * CONFIG.learning_rate
+
+
+def test_biases_do_not_decay():
+    learner = Fit(lambda params, window, key: jnp.zeros(()), replace(CONFIG, weight_decay=0.5, warmup=1), 0.8)
+    params = {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)}
+    state = learner.optimizer.init(params)
+    for _ in range(2):
+        change, state = learner.optimizer.update(jax.tree.map(jnp.zeros_like, params), state, params)
+    assert (change["kernel"] < 0).all() and (change["bias"] == 0).all()
+
+
+# ---------------------------------------------------------------------------------------------------- stop and go on
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_training_goes_on_to_the_same_end(learner, params, data, tmp_path, stop):
+    """To the bit. After Ctrl-C from the state of that moment, after a crash from the last one that was saved."""
+    whole = run(learner, params, data)
+
+    def interrupt(update: int, loss: float) -> None:
+        if update == 4:
+            raise stop
+
+    first = Checkpoints(tmp_path / "states", every_s=0.0 if stop is RuntimeError else 1e9)
+    with pytest.raises(stop):
+        run(learner, params, data, checkpoints=first, on_progress=interrupt)
+    first.close()
+    second, seen = Checkpoints(tmp_path / "states"), []
+    other = jax.tree.map(jnp.zeros_like, params)
+    again = run(learner, other, data, seed=5, checkpoints=second, on_progress=lambda u, _: seen.append(u))
+    second.close()
+    assert seen == ([6, 8] if stop is KeyboardInterrupt else [4, 6, 8])
+    assert same(again, whole)
+
+
+# ------------------------------------------------------------------------------------------------------- what counts
+
+
+def test_what_is_not_to_be_imitated_teaches_nothing(data, params):
+    data = data.replace(learn=(np.random.default_rng(0).random(data.learn.shape) < 0.5).astype(np.float32))
+    window = sample_windows(jax.random.key(0), data, data.rtg, MAZES, batch=8, steps=3, map_cell_m=0.8)
+    assert 0 < window.learn.mean() < 1
+    grad = jax.jit(jax.value_and_grad(transformer_loss(MODEL)))
+    shown = grad(params, window, jax.random.key(1))
+    other = window.replace(target=jnp.where(window.learn[..., None] > 0, window.target, 1e3))
+    assert same(shown, grad(params, other, jax.random.key(1)))
+    nothing = grad(params, window.replace(learn=0 * window.learn), jax.random.key(1))
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(nothing))
+    half = window.replace(learn=0.5 * window.learn)  # a weight of all is no weight
+    np.testing.assert_allclose(grad(params, half, jax.random.key(1))[0], shown[0], rtol=1e-5)
+
+
+def score(data):
+    straight = np.linalg.norm(data.goal - data.position[:, 0], axis=1)
+    return np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
+
+
+@pytest.mark.parametrize("top", [1.0, 0.5, 0.1])
+def test_the_value_network_sees_the_best(toy_data, top):
+    data = toy_data(list(range(5, 25)))
+    best = best_trajectories(data, ValueConfig(top=top))
+    assert best.n == max(1, round(top * data.n))
+    chosen = np.isin(data.length, best.length)
+    assert score(data)[chosen].min() >= score(data)[~chosen].max(initial=-np.inf)
+
+
+def test_the_value_network_sees_no_collision(toy_data):
+    data = toy_data([5] * 6, steps=8)
+    collision = np.zeros((6, 8), np.float32)
+    collision[0, 0] = collision[1, 4] = 1.0
+    collision[2, 5] = 1.0  # after its end: none of it
+    data = data.replace(collision=collision, proprio=data.proprio)
+    best = best_trajectories(data, ValueConfig(collision_free=True))
+    np.testing.assert_array_equal(best.proprio[:, 0, 0], [2, 3, 4, 5])
+    both = best_trajectories(data, ValueConfig(collision_free=True, top=0.5))
+    assert both.n == 2 and set(both.proprio[:, 0, 0]) < {2, 3, 4, 5}
+
+
+def test_no_trajectory_without_a_collision_is_an_error(toy_data):
+    data = toy_data([5, 5])
+    with pytest.raises(UserError, match="collision"):
+        best_trajectories(data.replace(collision=1 + 0 * data.collision), ValueConfig(collision_free=True))
+
+
+# ----------------------------------------------------------------------------------------------------------- devices
+
+ON_FOUR_DEVICES = """
+import sys
+from pathlib import Path
+import jax
+from ct_envs import load_maze, stack_mazes
+from ct_jax.fit import Fit, FitConfig, fit, init_params, value_loss
+from ct_jax.trajectories import load
+from ct_jax.value import ValueNetwork
+
+data, model, losses = load(Path(sys.argv[1])), ValueNetwork(8), []
+learner = Fit(value_loss(model), FitConfig(**eval(sys.argv[2])), 0.8)
+params = init_params(jax.random.key(0), model, data)
+assert len(learner.create(jax.random.key(0), params).update.sharding.device_set) == jax.device_count() == 4
+fit(
+    jax.random.key(0), learner, params, data, stack_mazes([load_maze("antmaze-umaze")]), chunk=2,
+    on_progress=lambda update, loss: losses.append(loss),
+)
+print(*losses)
+"""
+
+
+def test_four_devices_learn_the_same_as_one(data, tmp_path):
+    save(data, tmp_path / "data.npz")
+    config = {"updates": 6, "batch": 8, "steps": 2, "learning_rate": 1e-2, "warmup": 1}
+    environment = os.environ | {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    command = [sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path / "data.npz"), repr(config)]
+    four = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    assert four.returncode == 0, four.stderr
+    model, one = ValueNetwork(8), []
+    learner = Fit(value_loss(model), FitConfig(**config), 0.8)
+    params = init_params(jax.random.key(0), model, data)
+    run(learner, params, data, on_progress=lambda update, loss: one.append(loss))
+    assert len(one) == 3 and one[-1] < one[0]
+    np.testing.assert_allclose([float(loss) for loss in four.stdout.split()], one, rtol=1e-5)
+
+
+def test_without_compilation(data):
+    model = ValueNetwork(4)
+    learner = Fit(value_loss(model), FitConfig(updates=2, batch=2, steps=1, warmup=1), 0.8)
+    params = init_params(jax.random.key(0), model, data)
+    compiled = run(learner, params, data)
+    with jax.disable_jit():
+        plain = run(learner, params, data)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), plain, compiled)

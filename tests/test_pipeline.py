@@ -1,0 +1,317 @@
+"""The pipeline: a run's folder, and that whatever stops it, the next one goes on as if nothing had."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ct_envs import UserError, load_maze, robots
+from ct_jax import pipeline, run as runs
+from ct_jax.checkpoint import read_json
+from ct_jax.cli import main
+from ct_jax.evaluate import METHODS
+from ct_jax.model import load_model
+from ct_jax.presets import Settings
+from ct_jax.progress import Bar
+from ct_jax.run import Run, load_mazes, open_run
+
+pytestmark = pytest.mark.rank_promotion("allow")
+
+WEIGHTS = (
+    "controller/weights.safetensors", "fit/value.safetensors", "fit/fit.safetensors",
+    "finetune/value-1.safetensors", "finetune/fit-1.safetensors", "model/weights.safetensors",
+)  # fmt: skip
+STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate")
+
+
+def make_run(folder, settings, **changes):
+    mazes = load_mazes(("antmaze-umaze",))
+    run = Run(folder, "point", "tiny", settings, mazes, {}, seed=0, engine="auto")
+    return dataclasses.replace(run, **changes)
+
+
+def copy(tiny_run, tmp_path):
+    return Path(shutil.copytree(tiny_run.folder, tmp_path / "copy"))
+
+
+def read_array(file, name):
+    with np.load(file) as arrays:
+        return arrays[name]
+
+
+def times(folder):
+    return {str(file): file.stat().st_mtime_ns for file in folder.glob("*/done.json")}
+
+
+# ---------------------------------------------------------------------------------------------------- a whole run
+
+
+def test_a_run_leaves_everything_behind(tiny_run):
+    folder = tiny_run.folder
+    for stage in STAGES:
+        assert read_json(folder / stage / "done.json")["wall_s"] >= 0
+    for name in (*WEIGHTS, "report.html", "report.png", "model/model.json", "collect/trajectories.npz"):
+        assert (folder / name).stat().st_size > 0
+    assert list((folder / "tensorboard").glob("events.*"))
+    assert not list(folder.glob("*/checkpoints*")), "checkpoints of finished stages are not needed"
+    text = (folder / "metrics.jsonl").read_text()
+    lines = [json.loads(line, parse_constant=pytest.fail) for line in text.splitlines()]
+    assert {line["stage"] for line in lines} == {"controller", "value", "fit", "value-1", "fit-1"}
+
+
+def test_the_config_says_what_the_run_is_of(tiny_run, tiny_settings):
+    config = read_json(tiny_run.folder / "config.json")
+    assert (config["robot"], config["preset"], config["seed"], config["engine"]) == ("point", "tiny", 0, "auto")
+    assert list(config["mazes"]) == ["islands"] and list(config["eval_mazes"]) == ["antmaze-umaze"]
+    assert config["mazes"]["islands"].splitlines()[1] == "#...#...#"
+    assert config["settings"]["fit"]["updates"] == tiny_settings.fit.updates
+    assert config["versions"].keys() >= {"ct-jax", "python", "jax", "flax", "mujoco"}
+    assert config["hardware"] and config["commit"] and config["command"] and config["created"].startswith("20")
+
+
+def test_every_method_meets_the_same_pairs_in_every_maze(tiny_run):
+    rows = pipeline.results(tiny_run.folder)
+    places = [("islands", True), ("antmaze-umaze", False)]
+    assert [(row["maze"], row["seen"], row["method"]) for row in rows] == [(*p, m) for p in places for m in METHODS]
+    for maze, _ in places:
+        for name in ("start", "goal"):
+            drawn = [read_array(tiny_run.folder / "evaluate" / f"{maze}-{method}.npz", name) for method in METHODS]
+            assert len(drawn[0]) == 4 and all((each == drawn[0]).all() for each in drawn)
+    assert all(np.isfinite(row["spl"]) for row in rows)
+
+
+def test_start_and_goal_are_in_one_region(tiny_run):
+    pairs = read_json(next((tiny_run.folder / "evaluate").glob("pairs-islands-*.json")))
+    side = [np.array(pairs[name])[:, 0] < 18.0 for name in ("start", "goal")]  # the wall is 16 m to 20 m from the left
+    assert (side[0] == side[1]).all()
+
+
+def test_the_model_is_read_back_as_it_was_made(tiny_run, tiny_settings):
+    model = load_model(str(tiny_run.folder))
+    assert (model.robot, model.settings, model.made["seed"]) == ("point", tiny_settings, 0)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((model.policy, model.controller)))
+
+
+# ------------------------------------------------------------------------------------------------------- resuming
+
+
+def test_a_finished_run_is_not_run_again(tiny, tiny_run, tmp_path, monkeypatch):
+    folder = copy(tiny_run, tmp_path)
+    before = times(folder)
+    for name in ("build_roadmap", "train_controller", "collect", "recover", "fit", "evaluate"):
+        monkeypatch.setattr(pipeline, name, lambda *a, **k: pytest.fail("run again"))
+    (folder / "report.html").unlink()
+    assert main([*tiny_run.arguments, "--out", str(folder), "--resume"]) == 0
+    assert times(folder) == before and (folder / "report.html").is_file()
+
+
+def interrupt_in(monkeypatch, name, number):
+    """Sends a signal when the bar of that name moves for the first time."""
+    update = Bar.update
+
+    def moved(bar, done, note=""):
+        update(bar, done, note)
+        if bar.name == name:
+            monkeypatch.setattr(Bar, "update", update)
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Bar, "update", moved)
+
+
+def test_an_interrupted_run_ends_like_one_that_was_not(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+    """Stopped in the middle of every stage, by Ctrl-C and by SIGTERM: each time the rest is kept, and at the end
+    weights and results are those of the run that nothing stopped, to the last bit."""
+    folder = tmp_path / "stopped"
+    command = [*tiny_run.arguments, "--out", str(folder), "--resume"]
+    kept: dict[str, int] = {}
+    bars = ("controller", "collect", "value", "fit", "recover-1", "value-1", "fit-1", "planner in islands")
+    for i, name in enumerate(bars):
+        number = (signal.SIGINT, signal.SIGTERM)[i % 2]
+        interrupt_in(monkeypatch, name, number)
+        assert main(command) == {signal.SIGINT: 130, signal.SIGTERM: 0}[number], name
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert told.startswith("stopped; ") and "--resume" in told and str(folder) in told
+        now = times(folder)
+        assert kept.items() <= now.items(), "a finished stage was run again"
+        kept = now
+    rows = sorted((folder / "evaluate").glob("*-*.json"))
+    assert main(command) == 0
+    assert kept.items() <= times(folder).items()
+    assert "ct in islands" not in capsys.readouterr().err, f"run again: {rows}"
+    for name in WEIGHTS:
+        assert (folder / name).read_bytes() == (tiny_run.folder / name).read_bytes(), name
+    for ours, whole in zip(pipeline.results(folder), pipeline.results(tiny_run.folder), strict=True):
+        assert ours | {"wall_s": 0} == whole | {"wall_s": 0}
+
+
+def test_a_signal_during_physics_waits_for_the_program(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+    from ct_envs.physics import MujocoEngine
+
+    step, calls = MujocoEngine._step, []
+
+    def signalling(engine, *arguments):
+        calls.append(1)
+        if len(calls) == 10:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(engine, *arguments)
+
+    monkeypatch.setattr(MujocoEngine, "_step", signalling)
+    assert main([*tiny_run.arguments, "--out", str(tmp_path / "run")]) == 130
+    err = capsys.readouterr().err
+    assert "Traceback" not in err and err.splitlines()[-1].startswith("stopped; ")
+    assert list((tmp_path / "run" / "controller" / "checkpoints").glob("[0-9]*"))
+
+
+def test_time_adds_up_over_interruptions(tmp_path, tiny_settings, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(runs.time, "perf_counter", lambda: now[0])
+    run = make_run(tmp_path, tiny_settings)
+    for error in (KeyboardInterrupt, UserError, None):
+        try:
+            with run.stage("fit"):
+                now[0] += 10.0
+                if error:
+                    raise error
+        except (KeyboardInterrupt, UserError):
+            assert run.done("fit") is None
+    assert run.done("fit") == {"wall_s": 30.0} and not (tmp_path / "fit" / "spent.json").exists()
+
+
+# ------------------------------------------------------------------------------------------------- damaged folders
+
+
+def test_a_half_written_stage_is_run_again(tiny, tiny_run, tmp_path):
+    folder = copy(tiny_run, tmp_path)
+    weights = (folder / WEIGHTS[0]).read_bytes()
+    shutil.rmtree(folder / "model")
+    for name in ("controller", "collect"):
+        (folder / name / "done.json").unlink()
+    (folder / WEIGHTS[0]).write_bytes(weights[:50])
+    (folder / "collect" / "trajectories.npz").write_bytes(b"half")
+    assert main([*tiny_run.arguments, "--out", str(folder), "--resume"]) == 0
+    assert (folder / WEIGHTS[0]).read_bytes() == weights
+
+
+@pytest.mark.parametrize(
+    "name", [*WEIGHTS, "controller/done.json", "fit/done.json", "collect/trajectories.npz", "model/model.json"]
+)
+def test_a_damaged_file_is_named_with_the_mend(name, tiny, tiny_run, tmp_path, capsys):
+    """Cut to half: one line says which file and what to delete, and deleting that mends it."""
+    folder = copy(tiny_run, tmp_path)
+    if not name.startswith("model/"):
+        shutil.rmtree(folder / "model")
+    (folder / name).write_bytes((folder / name).read_bytes()[: (folder / name).stat().st_size // 2])
+    capsys.readouterr()
+    command = [*tiny_run.arguments, "--out", str(folder), "--resume"]
+    if name == WEIGHTS[-1]:
+        command = ["evaluate", str(folder)]
+    assert main(command) == 2
+    err = capsys.readouterr().err
+    line = err.splitlines()[-1]
+    assert line.startswith("error: ") and err.count("error") == 1 and "Traceback" not in err
+    assert str(folder / name) in line and f"delete {folder / Path(name).parent}" in line and "--resume" in line
+
+
+def test_a_damaged_newest_checkpoint_falls_back(tmp_path):
+    from ct_jax.checkpoint import Checkpoints
+
+    states = {step: {"a": np.full(1000, step, np.float32)} for step in (1, 2)}
+    checkpoints = Checkpoints(tmp_path)
+    for step, state in states.items():
+        checkpoints.save(step, state)
+    checkpoints.close()
+    for file in (tmp_path / "2").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    checkpoints = Checkpoints(tmp_path)
+    with pytest.warns(UserWarning, match=r"/2: damaged checkpoint"):
+        found = checkpoints.restore(states[1])
+    checkpoints.close()
+    assert found is not None and found[0] == 1 and (np.asarray(found[1]["a"]) == 1).all()
+
+
+# ------------------------------------------------------------------------------------------------ the run's folder
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"preset": "demo"}, "preset tiny, not demo"),
+        ({"seed": 1}, "seed 0, not 1"),
+        ({"engine": "mjx"}, "engine auto, not mjx"),
+        ({"robot": "ant"}, "robot point, not ant"),
+        ({"settings": Settings(rounds=3)}, r"settings\.\w+"),
+        ({"mazes": load_mazes(("antmaze-medium",))}, "mazes antmaze-umaze, not antmaze-medium"),
+        ({"mazes": {"antmaze-umaze": load_maze("antmaze-medium")}}, "another mazes.antmaze-umaze"),
+        ({"eval_mazes": load_mazes(("antmaze-medium",))}, "eval_mazes"),
+    ],
+)
+def test_a_run_goes_on_only_as_what_it_was_begun(changes, words, tmp_path, tiny_settings):
+    run = make_run(tmp_path / "run", tiny_settings)
+    with open_run(run, resume=False):
+        pass
+    for resume in (True, False):
+        with (
+            pytest.raises(UserError, match=f"config.json: a run with .*{words}.*--out"),
+            open_run(dataclasses.replace(run, **changes), resume=resume),
+        ):
+            pass
+    with pytest.raises(UserError, match="--resume"), open_run(run, resume=False):
+        pass
+    with open_run(run, resume=True):
+        pass
+
+
+def test_two_processes_do_not_work_in_one_folder(tmp_path, tiny_settings):
+    run = make_run(tmp_path / "run", tiny_settings)
+    with open_run(run, resume=True):
+        code = f"import fcntl; fcntl.flock(open({str(run.folder / 'run.lock')!r}), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+        held = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert "BlockingIOError" in held.stderr
+        with pytest.raises(UserError, match="another process"), open_run(run, resume=True):
+            pass
+
+
+def test_mazes_of_one_name_are_told_apart_or_refused(tmp_path):
+    for folder, text in (("a", "####\n#..#\n####"), ("b", "#####\n#...#\n#####")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "floor.txt").write_text(text)
+    same, other = str(tmp_path / "a" / "floor.txt"), str(tmp_path / "b" / "floor.txt")
+    assert list(load_mazes((same, same, "hall"))) == ["floor", "hall"]
+    with pytest.raises(UserError, match=r"b/floor\.txt: .*'floor' already"):
+        load_mazes((same, other))
+    with pytest.raises(UserError, match="'floor' already"):
+        runs.join_mazes(load_mazes((same,)), load_mazes((other,)))
+    assert list(runs.join_mazes(load_mazes((same,)), load_mazes((same, "hall")))) == ["floor", "hall"]
+
+
+# ------------------------------------------------------------------------------------------- without compilation
+
+
+@pytest.mark.slow
+def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, monkeypatch, islands):
+    spec = dataclasses.replace(robots.POINT, horizon=2, goal_tolerance_m=1.5)
+    monkeypatch.setitem(robots.ROBOTS, "point", spec)
+    change = dataclasses.replace
+    fit = change(tiny_settings.fit, updates=1, batch=1, steps=2)
+    settings = change(
+        tiny_settings,
+        prm=change(tiny_settings.prm, samples=12),
+        sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
+        collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
+        recover=change(tiny_settings.recover, stuck_steps=1, patience=1),
+        fit=fit,
+        value=change(tiny_settings.value, fit=change(fit, steps=1)),
+        episodes=2,
+    )
+    run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
+    assert pipeline.train(run).is_file()
+    assert {row["method"] for row in pipeline.results(run.folder)} == set(METHODS)

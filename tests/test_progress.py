@@ -1,0 +1,79 @@
+"""Progress and logs: what a person sees with and without a terminal, and files that stay readable."""
+
+import io
+import json
+import math
+
+import pytest
+from rich.console import Console
+
+from ct_jax import progress
+from ct_jax.interrupts import interruptible
+from ct_jax.progress import Bar, Metrics
+
+
+def test_a_terminal_shows_a_bar_with_the_time_left():
+    screen = io.StringIO()
+    with Bar("fit", 10, console=Console(file=screen, force_terminal=True, width=120)) as bar:
+        for done in (1, 5, 10):
+            bar.update(done, f"loss {1 / done:.2f}")
+    assert "fit" in screen.getvalue() and "10/10" in screen.getvalue()
+    assert "left" in screen.getvalue() and "loss 0.10" in screen.getvalue()
+
+
+def test_elsewhere_there_is_a_plain_line_now_and_then(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    with Bar("fit", 100) as bar:
+        for done in range(60, 101):  # resumed at 60: the 60 before took no time of this process
+            bar.update(done, "loss 0.5")
+            now[0] += 1.0
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == "" and "\x1b" not in err
+    assert lines == ["fit: 75/100, 25 s left loss 0.5", "fit: 90/100, 10 s left loss 0.5", "fit: done in 41 s"]
+
+
+def test_a_stopped_bar_does_not_say_done(capsys):
+    with pytest.raises(KeyboardInterrupt), Bar("fit", 10):
+        raise KeyboardInterrupt
+    assert "done" not in capsys.readouterr().err
+
+
+def test_a_bar_is_where_a_waiting_interrupt_comes_out():
+    import os
+    import signal
+
+    import jax
+    import numpy as np
+
+    def callback(x):
+        os.kill(os.getpid(), signal.SIGINT)
+        return np.asarray(x)
+
+    with interruptible(), Bar("fit", 2) as bar:
+        bar.update(1)
+        echo = jax.jit(lambda x: jax.pure_callback(callback, jax.ShapeDtypeStruct((), np.float32), x))
+        assert float(echo(2.0)) == 2.0  # not an error of XLA
+        with pytest.raises(KeyboardInterrupt):
+            bar.update(2)
+        bar.update(2)  # and only once
+
+
+def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
+    metrics = Metrics(tmp_path)
+    metrics.log("fit", 20, loss=0.5)
+    metrics.log("fit", 40, loss=math.nan, rate=2)
+    metrics.close()
+    lines = [json.loads(line, parse_constant=pytest.fail) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [(line["stage"], line["step"], line["loss"]) for line in lines] == [("fit", 20, 0.5), ("fit", 40, None)]
+    assert list((tmp_path / "tensorboard").glob("events.*"))
+
+
+def test_metrics_go_on_after_a_half_line(tmp_path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"stage": "fit", "step": 1}\n{"stage": "fi')
+    metrics = Metrics(tmp_path)
+    metrics.log("fit", 2, loss=0.5)
+    metrics.close()
+    assert [json.loads(line)["step"] for line in file.read_text().splitlines()] == [1, 2]

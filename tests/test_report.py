@@ -1,0 +1,389 @@
+"""The report: whole and self-contained, complete in what it lists, and calm about whatever a run folder lacks."""
+
+import json
+import re
+from html import escape
+from html.parser import HTMLParser
+from io import BytesIO
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from ct_envs import UserError
+from ct_envs.maze import draw_walls, load_walls
+from ct_jax.report import draw_maze, draw_paths, pictures, reading, words, write_report
+from ct_jax.report.page import page as to_html
+
+SEEN, UNSEEN = "antmaze-umaze", "antmaze-medium"
+METHODS = ("ct", "planner", "explorer", "some-other")
+HORIZON = 40
+VOID = {"meta", "link", "img", "br", "hr", "input", "image", "use"}
+
+
+class Page(HTMLParser):
+    """Reads a page: its tags, its text, and whether its tags nest."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags, self.open, self.text, self.rows, self.nested = [], [], "", [], True
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.rows.append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            self.nested &= bool(self.open) and self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" in self.open:
+            return
+        self.text += data
+        if "tr" in self.open:
+            self.rows[-1] += data + " "
+
+
+def make_episodes(seed: int, *, failures: int, n: int = 6) -> dict[str, np.ndarray]:
+    """Episodes of which the first ``failures`` stay where they are, and the others reach their goal half-way."""
+    rng = np.random.default_rng(seed)
+    start, goal = rng.uniform(4, 16, (2, n, 2)).astype(np.float32)
+    success = np.arange(n) >= failures
+    along = np.clip(2 * np.arange(1, HORIZON + 1) / HORIZON, 0, 1)[:, None, None] * success[:, None]
+    returns = -rng.uniform(10, 90, n)
+    return {
+        "path": np.float32(start + along * (goal - start)), "success": success, "collided": ~success,
+        "steps": np.where(success, HORIZON // 2, HORIZON), "returns": returns, "start": start, "goal": goal,
+        "asked": returns + 5,
+    }  # fmt: skip
+
+
+def make_row(maze: str, method: str, success_rate: float, n: int = 6) -> dict:
+    row = {"robot": "point", "method": method, "maze": maze, "seen": maze == SEEN, "episodes": n, "seed": 0}
+    row |= {"success_rate": success_rate, "spl": 0.5, "return_mean": -50.0, "return_scaled": -0.5}
+    row |= {"collision_rate": 0.125, "timeout_rate": 1 - success_rate, "steps_mean": 27.0, "wall_s": 1.0}
+    intervals = {"success_ci95": 0.1, "spl_ci95": 0.1, "return_scaled_ci95": 0.2, "timeout_ci95": 0.1}
+    return row | {key: [-half, half] for key, half in intervals.items()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The text and the page of a run with all there is."""
+    return read(write_run(tmp_path_factory.mktemp("whole"), failures=(2, 5), methods=METHODS))
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    """Writes a small run folder."""
+    return lambda **how: write_run(tmp_path, **how)
+
+
+def write_run(folder, *, failures=(0, 1), unseen=UNSEEN, methods=("ct",), n=6):
+    """Writes a run folder; ``failures`` are the transformer's in the seen and in the unseen maze."""
+    mazes = {SEEN: "antmaze-umaze", unseen: "antmaze-medium"}
+    texts = {name: draw_walls(load_walls(file)) for name, file in mazes.items()}
+    config = {"robot": "point", "preset": "demo", "seed": 7, "command": "ct-jax train point", "commit": "abc"}
+    config |= {"mazes": {SEEN: texts[SEEN]}, "eval_mazes": {unseen: texts[unseen]}, "engine": "mujoco"}
+    config |= {"versions": {"jax": "0.10.1"}, "settings": {"fit": {"memory": 32, "sizes": [1, 2]}}}
+    rows = []
+    for name, failed in zip(mazes, failures, strict=True):
+        for seed, method in enumerate(methods):
+            arrays = make_episodes(seed, failures=failed if method == "ct" else 0, n=n)
+            rows.append(make_row(name, method, float(arrays["success"].mean()), n))
+            write_arrays(folder / "evaluate" / f"{reading.slug(name)}-{method}.npz", **arrays)
+    points = np.random.default_rng(0).uniform(4, 16, (20, 2)).astype(np.float32)
+    write_arrays(folder / "prm" / "roadmap.npz", points=points, edges=np.array([[0, 1], [1, 2]]))
+    texts = {"config.json": json.dumps(config), "evaluate/results.json": json.dumps({"rows": rows})}
+    texts |= {"metrics.jsonl": make_metrics(), "fit/done.json": json.dumps({"wall_s": 61.0, "trajectories": 1234})}
+    for name, text in texts.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def write_arrays(file, **arrays):
+    file.parent.mkdir(exist_ok=True)
+    np.savez(file, **arrays)
+
+
+def make_metrics() -> str:
+    lines = [{"stage": "controller", "step": i, "time_s": i, "success": i / 9, "reward": i - 5.0} for i in range(10)]
+    lines += [
+        {"stage": s, "step": i, "time_s": i, "loss": 2.0**-i} for s in ("value", "fit", "fit-1") for i in range(10)
+    ]
+    return "\n".join(map(json.dumps, lines))
+
+
+def read(run) -> tuple[str, Page]:
+    html = write_report(run)
+    assert html == run / "report.html"
+    assert (run / "report.png").read_bytes().startswith(b"\x89PNG")
+    text = html.read_text("utf-8")
+    page = Page(text)
+    assert page.nested and not page.open
+    return text, page
+
+
+# ---------------------------------------------------------------------------------------------- a whole run
+
+
+def test_nothing_comes_from_outside(whole):
+    text, page = whole
+    links = [(k, v) for _, attrs in page.tags for k, v in attrs.items() if k in ("src", "href", "xlink:href", "srcset")]
+    assert links and all(link.startswith(("#", "data:")) for _, link in links)
+    assert not re.search(r"https?:|//|@import|url\((?!#)", text)
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
+
+
+def test_every_reference_within_the_page_is_defined_once(whole):
+    _, page = whole
+    defined = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
+    used = {v[1:] for _, attrs in page.tags for k, v in attrs.items() if k == "xlink:href"}
+    used |= {v[5:-1] for _, attrs in page.tags for k, v in attrs.items() if k == "clip-path"}
+    assert used <= set(defined)
+    assert len(defined) == len(set(defined))
+
+
+def test_pictures_have_words_and_colours_follow_the_theme(whole):
+    text, page = whole
+    shown = [attrs for tag, attrs in page.tags if tag == "svg" and "aria-hidden" not in attrs]
+    assert len(shown) > 10
+    assert all(attrs.get("role") == "img" and attrs.get("aria-label") for attrs in shown)
+    assert all(attrs.get("alt") for tag, attrs in page.tags if tag == "img")
+    used = set(re.findall(r"var\(--(\w+)\)", text))
+    declared = [set(re.findall(r"--(\w+): #", part)) for part in text.split("prefers-color-scheme")[:2]]
+    assert used - {"low", "at", "high", "share"} <= declared[0] & declared[1]
+
+
+def test_the_table_has_every_method_of_every_maze(whole):
+    _, page = whole
+    labels = [row.strip() for row in page.rows]
+    for method in METHODS:
+        assert labels.count(words.method_label(method)) == 2
+    figures = [row for row in page.rows if "−0.5" in row]
+    assert len(figures) == 2 * len(METHODS)
+    assert any("67" in row and "12" in row and "27" in row for row in figures)
+    assert page.text.index(SEEN) < page.text.index(UNSEEN)
+
+
+def test_every_failure_is_listed_and_marked(whole):
+    text, page = whole
+    assert len([row for row in page.rows if "stayed on one spot" in row]) == 7
+    assert "2 failures: Control Transformer in antmaze-umaze" in page.text
+    for failed, figure in zip(
+        (2, 5), re.findall(r"<svg[^>]*Paths of Control Transformer.*?</svg>", text, re.S), strict=True
+    ):
+        crosses = [g for g in figure.split("<defs>") if "fill: var(--fail)" in g]
+        assert sum(g.count("<use") for g in crosses) == failed
+
+
+def test_the_verdict_says_how_it_fails(whole):
+    _, page = whole
+    assert "reached 4 of 6 goals in the maze it was trained in and 1 of 6 in a maze it had never seen" in page.text
+    assert "all 7 times it failed, it stayed on one spot" in page.text
+
+
+def test_a_run_without_failures_says_so(make_run):
+    _, page = read(make_run(failures=(0, 0)))
+    assert "did not fail once" in page.text
+    assert "failures:" not in page.text
+
+
+def test_the_same_run_gives_the_same_page(make_run):
+    run = make_run()
+    assert read(run)[0] == read(run)[0]
+
+
+def test_a_large_run_stays_a_small_page(make_run):
+    run = make_run()
+    rng = np.random.default_rng(0)
+    n, steps = 300, 500
+    for file in (run / "evaluate").glob("*.npz"):
+        path = np.abs(np.cumsum(rng.normal(0, 0.5, (steps, n, 2)), 0) % 40 - 20).astype(np.float32)
+        ends = {"start": path[0], "goal": path[-1], "returns": np.zeros(n), "asked": np.ones(n)}
+        write_arrays(file, path=path, success=np.zeros(n, bool), steps=np.full(n, steps), **ends)
+    assert write_report(run).stat().st_size < 5e6
+
+
+# -------------------------------------------------------------------------------------- what a run may lack
+
+
+def everything(run):
+    return sorted(str(f.relative_to(run)) for f in run.rglob("*") if f.is_file() and f.name != "config.json")
+
+
+def strip(run):
+    """Leaves nothing but the configuration."""
+    for file in everything(run):
+        (run / file).unlink()
+    return run
+
+
+PARTS = ["evaluate/antmaze-medium-ct.npz", "evaluate/results.json", "metrics.jsonl", "fit/done.json", "prm/roadmap.npz"]
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.95, None])
+def test_any_part_may_be_missing_or_torn(make_run, part, kept):
+    run = make_run()
+    assert set(PARTS) < set(everything(run))
+    whole = (run / part).read_bytes()
+    (run / part).unlink()
+    if kept is not None:
+        (run / part).write_bytes(whole[: int(kept * len(whole))])
+    Page(to_html(reading.read_run(run)))
+
+
+def test_a_run_that_has_only_begun_says_what_is_missing(make_run):
+    _, page = read(strip(make_run()))
+    for file in ("evaluate/results.json", "prm/roadmap.npz", "metrics.jsonl", "*/done.json"):
+        assert file in page.text
+    assert "ct-jax train point" in page.text
+
+
+def test_a_torn_line_of_metrics_is_left_out(make_run):
+    run = make_run()
+    whole, _ = read(run)
+    torn = '[]\n{"stage": "fit", "step": "x", "loss": 3}\n{"stage": "fit", "step": 5, "loss": NaN}\n{"stage": "fi'
+    (run / "metrics.jsonl").write_text(make_metrics() + "\n" + torn)
+    assert read(run)[0] == whole
+
+
+@pytest.mark.parametrize("value", [None, [], 3, "text", {"rows": 3}, {"rows": [3, {}, {"maze": 1, "method": None}]}])
+def test_results_of_another_shape_are_no_results(make_run, value):
+    run = make_run()
+    (run / "evaluate" / "results.json").write_text(json.dumps(value))
+    read(run)
+
+
+@pytest.mark.parametrize("value", [None, [], 3, "text", {"a": None}, {"a": "not a maze"}])
+def test_a_config_of_another_shape_is_shown_as_far_as_it_goes(make_run, value):
+    run = strip(make_run())
+    for key in ("mazes", "eval_mazes", "settings", "versions", "command", "created", "robot", "cell_m"):
+        (run / "config.json").write_text(json.dumps({key: value}))
+        to_html(reading.read_run(run))
+    (run / "config.json").write_text(json.dumps(dict.fromkeys(("robot", "seed", "command", "mazes"), value)))
+    read(run)
+
+
+def test_a_row_may_lack_figures(make_run):
+    run = make_run()
+    rows = [{"maze": SEEN, "method": "ct"}, make_row(UNSEEN, "ct", float("nan"))]
+    (run / "evaluate" / "results.json").write_text(json.dumps({"rows": rows}))
+    _, page = read(run)
+    assert sum(row.strip() == words.method_label("ct") for row in page.rows) == 2
+
+
+def test_broken_episodes_are_drawn_as_far_as_they_go(make_run):
+    run = make_run()
+    arrays = make_episodes(0, failures=6)
+    arrays["path"][3:] = np.nan
+    arrays["start"][0] = np.nan
+    arrays["steps"][1] = 0
+    write_arrays(run / "evaluate" / f"{UNSEEN}-ct.npz", **arrays)
+    read(run)
+
+
+@pytest.mark.parametrize("name", ["missing", "empty", "file", "broken", "list"])
+def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
+    run = tmp_path / name
+    if name == "file":
+        run.write_text("")
+    elif name != "missing":
+        run.mkdir()
+    if name in ("broken", "list"):
+        (run / "config.json").write_text('{"robot": ' if name == "broken" else "[]")
+    with pytest.raises(UserError, match=r"config\.json|no folder") as error:
+        write_report(run)
+    assert str(run) in str(error.value) and "\n" not in str(error.value)
+    assert run.is_file() or not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ['<script>alert("x")</script>', "a'b\"c&d", "$\\frac{1}{$", "../../etc/maze", "迷路 🤖", "\ud800", "x" * 500],
+)
+def test_a_name_is_only_ever_text(make_run, name):
+    text, page = read(make_run(unseen=name))
+    shown = name.encode("utf-8", "replace").decode()
+    assert not any(tag == "script" for tag, _ in page.tags)
+    assert shown in page.text
+    assert escape(shown) in text
+    assert shown == escape(shown) or shown not in text
+
+
+# ------------------------------------------------------------------------------------------------ the parts
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 40), (40, 3), (9, 12), (120, 130)])
+def test_a_maze_fills_its_figure_and_is_drawn_right_way_up(shape):
+    walls = np.random.default_rng(0).random(shape) < 0.5
+    walls[[0, -1]] = walls[:, [0, -1]] = True
+    walls[1, 1:-1] = False  # the lowest free row
+    figure, ax = pictures.maze_figure(walls)
+    draw_maze(ax, walls, 2.0)
+    low, high = ax.get_ylim()
+    assert low < high and ax.get_xlim()[1] < 2.0 * shape[1]
+    assert "<svg" in pictures.to_svg(figure, "maze")
+    file = BytesIO()
+    figure.savefig(file, format="rgba")
+    pixels = np.frombuffer(file.getvalue(), np.uint8).reshape(*map(int, figure.canvas.get_width_height()[::-1]), 4)
+    lowest_free = round(len(pixels) * (1 - (1.5 * 2.0 - low) / (high - low)))
+    middle = pixels[min(lowest_free, len(pixels) - 1), pixels.shape[1] // 2, :3].astype(int)
+    if abs(figure.get_figwidth() / figure.get_figheight() * pictures.aspect(walls) - 1) < 0.01:
+        assert (middle > 240).all()
+
+
+@pytest.mark.parametrize("n", [1, 5])
+@pytest.mark.parametrize("steps", [0, 1, 30])
+def test_paths_of_any_length_can_be_drawn(n, steps):
+    figure = Figure()
+    ax = figure.add_subplot()
+    path = np.zeros((30, n, 2), np.float32)
+    draw_maze(ax, load_walls(SEEN))
+    draw_paths(ax, path, np.arange(n) % 2 == 0, np.full(n, steps), path[0], path[0] + 1)
+    pictures.to_svg(figure, "paths")
+
+
+def test_resampling_keeps_the_way_and_its_ends():
+    angle = np.linspace(0, 6, 400)
+    way = np.stack([np.cos(angle), np.sin(angle)], 1) * 10
+    points, time = pictures.resample(way, 0.5)
+    np.testing.assert_allclose(points[[0, -1]], way[[0, -1]])
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 10, rtol=1e-2)
+    assert (np.diff(time) > 0).all() and time[0] == 0 and time[-1] == 1
+
+
+def test_the_running_mean_of_a_line_is_the_line_inside_and_a_mean_at_the_ends():
+    values = np.arange(100.0)
+    smooth = pictures.running_mean(values)
+    np.testing.assert_allclose(smooth[5:-5], values[5:-5])
+    np.testing.assert_allclose(smooth[0], values[:6].mean())
+    np.testing.assert_array_equal(pictures.running_mean(values[:1]), values[:1])
+
+
+@pytest.mark.parametrize(
+    ("way", "steps", "kind"),
+    [
+        (np.full(400, 10.0), 400, "stuck"),
+        (10 + 10 * np.sin(np.linspace(0, 120, 400)), 400, "circled"),
+        (np.linspace(0, 40, 400), 400, "late"),
+        (np.linspace(0, 40, 400), 100, "early"),
+    ],
+)
+def test_a_failure_is_told_by_its_way(make_run, way, steps, kind):
+    arrays = make_episodes(0, failures=1, n=2)
+    path = np.repeat(np.stack([way, np.full(400, 6.0)], 1)[:, None], 2, 1)
+    run = make_run()
+    arrays |= {"path": path, "start": path[0], "steps": np.array([steps, 400])}
+    write_arrays(run / "evaluate" / f"{SEEN}-ct.npz", **arrays)
+    found = reading.read_run(run)
+    episodes = next(e for e in found.episodes if e.maze == SEEN and e.method == "ct")
+    assert words.failure_kind(found, episodes, 0) == kind

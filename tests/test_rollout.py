@@ -1,0 +1,114 @@
+"""The rollout: it records what happened, and a disturbance is done but neither meant nor imitated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from ct_envs import MazeEnv, load_maze, stack_mazes
+from ct_jax.collect import run_episodes, start_episodes
+from ct_jax.rollout import Guided, act_as_meant, rollout
+
+N = 4
+ENV = MazeEnv("point", engine="mujoco", auto_reset=False, maps=False, horizon=9)
+
+
+@pytest.fixture(scope="module")
+def start():
+    """Four episodes in an L of free cells: the first ends at once, the second soon."""
+    mazes = stack_mazes([load_maze("antmaze-umaze")] * N)
+    begin = jnp.tile(jnp.array([[6.0, 6.0]]), (N, 1))
+    goal = jnp.array([[6.2, 6.0], [6.9, 6.0], [14.0, 6.0], [14.0, 14.0]])
+    return start_episodes(ENV, jax.random.key(0), mazes, begin, goal)
+
+
+@struct.dataclass
+class Straight:
+    """A guide that points at the goal, and counts how often it was asked."""
+
+    def waypoint(self, memory, maze, position, goal):
+        return goal, memory + 1
+
+
+def test_what_is_recorded_is_what_happened(start, push):
+    guided = Guided(push(), Straight())
+    state, (asked, _), steps = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)
+    assert int(asked) == 9
+    step, now = jax.jit(jax.vmap(ENV.step)), start
+    for t in range(9):
+        np.testing.assert_array_equal(steps.position[t], now.info["position"])
+        np.testing.assert_array_equal(steps.proprio[t], now.obs["proprio"])
+        np.testing.assert_array_equal(steps.alive[t], 1 - now.done)
+        now = step(now, steps.action[t])
+        np.testing.assert_allclose(steps.reward[t], now.reward, rtol=1e-5)
+        np.testing.assert_array_equal(steps.success[t], now.info["success"])
+    np.testing.assert_allclose(state.info["position"], now.info["position"], atol=1e-4)
+    np.testing.assert_array_equal(state.done, 1.0)
+    np.testing.assert_array_equal(state.info["success"], [1, 1, 0, 0])
+
+
+def test_finished_episodes_stay_where_they_are(start, push):
+    guided = Guided(push(), Straight())
+    _, _, steps = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)
+    alive, position = np.asarray(steps.alive), np.asarray(steps.position)
+    assert (np.diff(alive, axis=0) <= 0).all()
+    for i, length in enumerate(alive.sum(0).astype(int)):
+        assert (position[length:, i] == position[length : length + 1, i]).all()
+    assert alive.sum(0)[0] == 1 and alive.sum(0)[1] < 9
+
+
+def test_a_disturbance_is_done_but_not_meant(start, push):
+    guided = Guided(push(), Straight(), 0.5)
+    memory, record = guided.init(start, jnp.zeros(())), []
+    act = jax.jit(Guided.act)
+    for key in jax.random.split(jax.random.key(0), 200):
+        action, memory = act(guided, memory, start, key)
+        record.append(np.asarray(action.done - action.meant))
+        np.testing.assert_array_equal(action.meant, guided.intend(jnp.zeros(()), start)[0])
+        np.testing.assert_array_equal(action.target, action.meant)
+        np.testing.assert_array_equal(action.learn, 1.0)
+    record = np.array(record)
+    assert abs(record[20:].mean()) < 0.2 and 0.35 < record[20:].std() < 0.65
+    held = (np.abs(np.diff(record, axis=0)) < 1e-6).all(-1)
+    assert 0.85 < held.mean() < 0.95  # it lasts some ten steps
+    assert not np.array_equal(held[:, 0], held[:, 1])  # each environment has its own
+
+
+def test_without_noise_nothing_is_drawn(start, push):
+    guided = Guided(push(), Straight())
+    memory = guided.init(start, jnp.zeros(()))
+    one, other = (guided.act(memory, start, jax.random.key(seed))[0] for seed in (0, 1))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+    np.testing.assert_array_equal(one.done, one.meant)
+
+
+def test_episodes_run_in_chunks_until_all_are_over(start, push):
+    """Chunks change nothing but the end, which comes when nothing is left to run."""
+    guided = Guided(push(), Straight())
+    whole = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)[2]
+    seen = []
+    _, _, steps = run_episodes(
+        ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), chunk=3, limit=99,
+        on_progress=lambda step, over: seen.append((step, over)),
+    )  # fmt: skip
+    assert [step for step, _ in seen] == [3, 6, 9] and seen[-1][1] == N
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), steps, whole)
+    _, _, cut = run_episodes(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), chunk=3, limit=6)
+    assert len(cut.reward) == 6
+
+
+def test_as_meant():
+    action = act_as_meant(jnp.ones((3, 2)))
+    for leaf in action[:3]:
+        np.testing.assert_array_equal(leaf, np.ones((3, 2)))
+    np.testing.assert_array_equal(action.learn, np.ones(3))
+
+
+def test_without_compilation(start, push):
+    guided = Guided(push(), Straight(), 0.3)
+    memory = guided.init(start, jnp.zeros(()))
+    compiled = rollout(ENV, guided, start, memory, jax.random.key(0), 2)[2]
+    with jax.disable_jit():
+        plain = rollout(ENV, guided, start, memory, jax.random.key(0), 2)[2]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plain, compiled)

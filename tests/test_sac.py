@@ -1,0 +1,217 @@
+"""The low-level controller's training: what goes into the replay, what is rewarded, and that it can be continued."""
+
+import functools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ct_envs import POINT, MazeEnv, Tasks, UserError, load_maze
+from ct_jax.checkpoint import Checkpoints
+from ct_jax.controllers.sac import Sac, SacConfig, SacController, edge_success, split_edges, train_controller
+from ct_jax.prm import PrmConfig, build_roadmap
+
+pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
+
+UMAZE = load_maze("antmaze-umaze")
+TINY = SacConfig(
+    envs=4, iterations=8, updates=2, warmup=3, batch=8, hidden=(8,), replay=64, episode_steps=4, held_out=0.2
+)
+ENV = functools.partial(MazeEnv, POINT, engine="mujoco")
+
+
+@pytest.fixture(scope="module")
+def roadmap():
+    return build_roadmap(jax.random.key(0), UMAZE, radius_m=0.5, config=PrmConfig(samples=40))
+
+
+def make(config: SacConfig = TINY, robot=POINT) -> Sac:
+    return Sac(MazeEnv(robot, engine="mujoco", maps=False, horizon=config.episode_steps), config)
+
+
+@pytest.fixture(scope="module")
+def sac():
+    return make()
+
+
+@pytest.fixture(scope="module")
+def fresh(sac, roadmap):
+    return sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+
+
+def leaves(tree) -> list[np.ndarray]:
+    def plain(leaf):
+        return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+    return [np.asarray(plain(leaf)) for leaf in jax.tree.leaves(tree)]
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(leaves(a), leaves(b), strict=True))
+
+
+# ----------------------------------------------------------------------------------------------------------- edges
+
+
+def ends(tasks: Tasks) -> list[tuple]:
+    return [(tuple(s), tuple(g)) for s, g in zip(np.asarray(tasks.start), np.asarray(tasks.goal), strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_held_out_edges_are_new_in_both_directions(roadmap, seed):
+    train, test = (ends(tasks) for tasks in split_edges(roadmap, 0.2, seed))
+    expected = roadmap.points[roadmap.edges]
+    assert len(train) + len(test) == 2 * len(expected)
+    assert {frozenset(edge) for edge in train}.isdisjoint(frozenset(edge) for edge in test)
+    for edges in (train, test):
+        assert {(goal, start) for start, goal in edges} == set(edges)  # there and back
+    everything = {frozenset(map(tuple, edge)) for edge in expected}
+    assert {frozenset(edge) for edge in train + test} == everything
+    assert abs(len(test) / (2 * len(expected)) - 0.2) < 0.02
+
+
+def test_the_seed_decides_which_edges_are_held_out(roadmap):
+    first, again, other = (ends(split_edges(roadmap, 0.2, seed)[1]) for seed in (0, 0, 1))
+    assert first == again != other
+
+
+def test_too_few_edges_are_an_error(roadmap):
+    few = replace(roadmap, edges=roadmap.edges[:4])
+    with pytest.raises(UserError, match="only 4 edges"):
+        split_edges(few, 0.1, 0)
+
+
+# ------------------------------------------------------------------------------------------------------- training
+
+
+def test_a_few_iterations(sac, fresh):
+    """Nothing is learned in the warm-up; afterwards everything moves, and stays finite."""
+    warm, _ = sac.train(fresh, TINY.warmup)
+    assert same(warm.policy, fresh.policy) and same(warm.critic, fresh.critic)
+    after, metrics = sac.train(warm, 5)
+    for name in ("policy", "critic", "target_critic", "log_alpha"):
+        assert not same(getattr(after, name), getattr(warm, name)), name
+    assert all(np.isfinite(leaf).all() for leaf in leaves(after)) and np.isfinite(list(metrics.values())).all()
+    assert int(after.iteration) == 8
+    assert {"reward", "success", "episodes", "critic_loss", "actor_loss", "alpha"} <= set(metrics)
+
+
+def test_the_replay_holds_what_happened(sac, fresh):
+    """Row by row: what was seen, done and rewarded, in order, until the oldest is overwritten."""
+    state, rows = fresh, []
+    collect = jax.jit(sac._collect)
+    for _ in range(3):
+        before = state
+        state, _ = collect(before)
+        seen, now = (np.concatenate([s.env.obs["proprio"], s.env.obs["goal"]], -1) for s in (before, state))
+        rows.append((seen, now, np.asarray(state.env.done), np.asarray(state.env.info["truncation"])))
+    data = np.asarray(state.replay.data)[: 3 * TINY.envs]
+    unflatten = jax.vmap(sac._buffer._unflatten_fn)
+    kept = unflatten(data)
+    for i, (seen, now, done, truncation) in enumerate(rows):
+        part = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i * TINY.envs : (i + 1) * TINY.envs], kept)
+        np.testing.assert_array_equal(part.observation, seen)
+        np.testing.assert_array_equal(part.next_observation, now)
+        np.testing.assert_array_equal(part.discount, 1 - done)
+        np.testing.assert_array_equal(part.extras["state_extras"]["truncation"], truncation)
+        assert np.abs(part.action).max() <= 1
+    for _ in range(20):
+        state, _ = collect(state)
+    newest = np.concatenate([state.env.obs["proprio"], state.env.obs["goal"]], -1)
+    kept = unflatten(np.asarray(state.replay.data))
+    assert len(kept.reward) == TINY.replay
+    found = [(np.asarray(kept.next_observation) == row).all(1).any() for row in newest]
+    assert all(found)
+
+
+def test_the_target_follows_at_its_rate(sac, fresh):
+    state, _ = sac.train(fresh, TINY.warmup + 2)
+    after, _ = jax.jit(sac._update)(state)
+    rate = TINY.target_rate
+    for old, new, critic in zip(*map(leaves, (state.target_critic, after.target_critic, after.critic)), strict=True):
+        np.testing.assert_allclose(new, (1 - rate) * old + rate * critic, atol=1e-6)
+    assert not same(state.target_critic, after.target_critic)
+
+
+@pytest.mark.parametrize("kind", ["velocity", "distance"])
+def test_rewards(kind, roadmap):
+    """Velocity: metres nearer per second. Distance: minus the metres that are left. The bonus: at the goal only."""
+    robot = replace(POINT, controller_reward=kind)
+    sac = make(robot=robot)
+    tasks = Tasks(jnp.array([[6.0, 6.0], [6.0, 6.0]]), jnp.array([[6.9, 6.0], [6.0, 14.0]]), jnp.asarray(2))
+    state = sac.create(jax.random.key(1), UMAZE, tasks).env
+    before = np.linalg.norm(state.obs["goal"], axis=-1)
+    step, reward = jax.jit(jax.vmap(sac.env.step)), jax.jit(sac._reward)
+    arrived = False
+    for _ in range(4):
+        after = step(state, jnp.tile(jnp.array([[1.0, 0.0]]), (TINY.envs, 1)))
+        left = -np.asarray(after.reward)
+        dense = (before - left) / 0.1 if kind == "velocity" else -left
+        won = (np.asarray(after.info["success"]) * np.asarray(after.done)) > 0
+        np.testing.assert_allclose(reward(state, after), dense + TINY.arrival_bonus * won, atol=1e-3)
+        arrived |= won.any() and not won.all()
+        state, before = after, np.linalg.norm(after.obs["goal"], axis=-1)
+    assert arrived
+
+
+def test_it_goes_on_as_if_nothing_had_happened(roadmap, tmp_path):
+    """Interrupted by Ctrl-C and continued: the same controller, to the bit."""
+    train = functools.partial(train_controller, jax.random.key(0), ENV, UMAZE, roadmap, TINY, chunk=4)
+    seen = []
+    whole, success = train(on_progress=lambda i, metrics: seen.append((i, metrics["critic_loss"])))
+    assert [i for i, _ in seen] == [4, 8] and 0 <= success <= 1
+
+    def interrupt(iteration, metrics):
+        raise KeyboardInterrupt
+
+    first = Checkpoints(tmp_path / "states")
+    with pytest.raises(KeyboardInterrupt):
+        train(on_progress=interrupt, checkpoints=first)
+    first.close()
+    second, rest = Checkpoints(tmp_path / "states"), []
+    again, again_success = train(on_progress=lambda i, _: rest.append(i), checkpoints=second)
+    second.close()
+    assert rest == [8]
+    assert same(again, whole) and again_success == success
+
+
+# ---------------------------------------------------------------------------------------------------- the result
+
+
+def test_success_on_edges_is_the_share_that_is_walked(push, roadmap):
+    env = MazeEnv(POINT, engine="mujoco", maps=False, auto_reset=False, horizon=40)
+    _, tasks = split_edges(roadmap, 0.1, 0)
+    assert edge_success(env, push(), UMAZE, tasks, jax.random.key(0)) > 0.95
+    still = np.linalg.norm(tasks.start - tasks.goal, axis=1) < 0.5  # there from the first
+    assert edge_success(env, push(0.0), UMAZE, tasks, jax.random.key(0)) == pytest.approx(still.mean())
+
+
+def test_the_controller_is_the_policy_without_chance(sac, fresh):
+    act = SacController(fresh.normalizer, fresh.policy, 2, TINY.hidden)
+    proprio, goal = fresh.env.obs["proprio"], fresh.env.obs["goal"]
+    action = act(proprio, goal)
+    assert action.shape == (TINY.envs, 2) and (np.abs(action) <= 1).all()
+    np.testing.assert_allclose(act(proprio[:1], goal[:1]), action[:1], atol=1e-6)
+    logits = sac.networks.policy_network.apply(fresh.normalizer, fresh.policy, jnp.concatenate([proprio, goal], -1))
+    np.testing.assert_allclose(action, np.tanh(logits[:, :2]), atol=1e-6)
+
+
+def test_without_compilation(roadmap):
+    config = replace(TINY, envs=2, updates=1, warmup=1, batch=2, hidden=(4,), replay=8)
+    sac = make(config)
+    fresh = sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+    compiled, _ = sac.train(fresh, 2)
+    with jax.disable_jit():
+        plain, _ = sac.train(fresh, 2)
+    for a, b in zip(leaves(plain.policy), leaves(compiled.policy), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_it_learns_to_walk(roadmap):
+    """The umaze in half a minute or so."""
+    config = SacConfig(iterations=400, warmup=10, hidden=(64, 64), episode_steps=40)
+    _, success = train_controller(jax.random.key(0), ENV, UMAZE, roadmap, config)
+    assert success > 0.9
