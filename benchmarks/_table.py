@@ -34,6 +34,10 @@ def time_alone(function: Callable[[], object], *, repeat: int = 15) -> list[floa
     return time_pairs(function, lambda: None, repeat=repeat)[0]
 
 
+def _figure(value: float) -> str:
+    return f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"
+
+
 class Results:
     """Rows of one benchmark."""
 
@@ -56,7 +60,7 @@ class Results:
         for row in self._rows:
             ratio = row["ratio"]
             table.add_row(
-                row["name"], *(f"{row[k]:,.3g}" if row[k] < 1000 else f"{row[k]:,.0f}" for k in ("value", "min", "max")),
+                row["name"], *(_figure(row[name]) for name in ("value", "min", "max")),
                 row["unit"], row["against"],
                 f"{ratio['median']:.2f} ({ratio['min']:.2f}-{ratio['max']:.2f})" if ratio else "",
             )  # fmt: skip

@@ -1,6 +1,6 @@
 """One acting step of a transformer for many environments: key/value cache against recomputing the window.
 
-    python benchmarks/acting.py [--preset demo] [--envs 100] [--context 50]
+python benchmarks/acting.py [--preset demo] [--envs 100] [--context 50]
 """
 
 from dataclasses import dataclass, replace

@@ -1,6 +1,6 @@
 """Time to build a roadmap and its next-hop table, warm, in ``antmaze-large``; the paper's is 200 samples, 10 m.
 
-    python benchmarks/prm.py
+python benchmarks/prm.py
 """
 
 import jax

@@ -12,7 +12,7 @@ from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
-from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, stack_tables
+from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap
 from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
 
@@ -163,7 +163,7 @@ class Batch:
 def draw_batch(
     key: jax.Array, env: MazeEnv, mazes: Maze, config: CollectConfig, prm: PrmConfig, *, first_maze: int = 0
 ) -> Batch:
-    """Fresh roadmaps, one for every ``reset_interval`` episodes and on one maze after the other, and episodes on them."""
+    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them."""
     n_maps = max(1, config.envs // config.reset_interval)
     per_map = -(-config.envs // n_maps)
     maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]

@@ -12,9 +12,9 @@ from scipy import stats
 
 from ct_envs import MazeEnv
 from ct_envs.maze import Maze, sample_pair
-from ct_jax.collect import plan_memory, run_episodes, start_episodes, make_guide
-from ct_jax.prm import PlanTable, PrmConfig, Roadmap, build_roadmap, extend
+from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
 from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PlanTable, PrmConfig, build_roadmap, extend
 from ct_jax.rollout import Controller, Guided, Steps
 
 METHODS = ("ct", "planner", "explorer")

@@ -80,9 +80,7 @@ def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
     def sweep(carry):
         d, _ = carry
         p = jnp.pad(d, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
-        near = jnp.minimum(
-            jnp.minimum(p[:, :-2, 1:-1], p[:, 2:, 1:-1]), jnp.minimum(p[:, 1:-1, :-2], p[:, 1:-1, 2:])
-        )
+        near = jnp.minimum(jnp.minimum(p[:, :-2, 1:-1], p[:, 2:, 1:-1]), jnp.minimum(p[:, 1:-1, :-2], p[:, 1:-1, 2:]))
         new = jnp.minimum(d, near + cost)
         return new, jnp.any(new < d)
 

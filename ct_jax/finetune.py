@@ -31,9 +31,7 @@ class RecoverConfig:
     stuck_m: float = 4.0  # ... the robot moved less than this [m]
     patience: int = 200  # failure: not at the goal after so many steps
     takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
-    keep: str = (
-        "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
-    )
+    keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
     # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
     give_up: float = 20.0  # stop after this many times T episodes
 
@@ -69,9 +67,7 @@ class Supervised:
         position = state.info["position"]
         rescued = memory.rescued | self._failed(memory, position)
         rescued |= jax.random.bernoulli(chance_key, self.config.takeover, rescued.shape)
-        action = jax.tree.map(
-            lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own
-        )
+        action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
         if self.config.keep == "relabelled":
             action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape))
         else:
@@ -120,9 +116,7 @@ def recover(
         first = episodes // collecting.reset_interval
         batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first)
         plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-        memory = supervised.init(
-            batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan)
-        )
+        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
         state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
         data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
         rescued = np.asarray(state.info["success"]) > 0
@@ -140,9 +134,7 @@ def _split(data: Trajectories) -> list[Trajectories]:
     """Each trajectory as two: up to the failure, and the recovery from it."""
     learn = np.asarray(data.learn)
     begin = learn.argmax(1)
-    fail = data.replace(
-        length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None])
-    )
+    fail = data.replace(length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None]))
     later = np.minimum(np.arange(learn.shape[1]) + begin[:, None], learn.shape[1] - 1)
     row = np.arange(data.n)[:, None]
     moved = {name: np.asarray(getattr(data, name))[row, later] for name in PER_STEP}

@@ -170,7 +170,7 @@ def best_trajectories(data: Trajectories, config: ValueConfig) -> Trajectories:
         inside = np.arange(data.collision.shape[1]) < np.asarray(data.length)[:, None]
         keep &= ~((np.asarray(data.collision) > 0) & inside).any(1)
         if not keep.any():
-            raise UserError("every trajectory has a collision: give the roadmap a margin, or set collision_free to false")
+            raise UserError("every trajectory has a collision: give the roadmap a margin, or allow collisions")
     if config.top < 1.0:
         straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
         score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
@@ -215,4 +215,3 @@ def fit(
             checkpoints.save(done, state)
         raise
     return jax.device_get(state.params)
-

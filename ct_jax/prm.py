@@ -141,9 +141,7 @@ def _connect(points: np.ndarray, maze: Maze, radius_m: float, config: PrmConfig)
     graph = nx.Graph()
     graph.add_nodes_from(range(len(points)))
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    graph.add_weighted_edges_from(
-        zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True)
-    )
+    graph.add_weighted_edges_from(zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True))
     return Roadmap(graph, points, edges, maze, radius_m, config)
 
 
@@ -269,11 +267,11 @@ class RoadmapGuide:
         best = jnp.argmin(way, -1)[:, None]  # all infinite: the first, which is the nearest
         return jnp.take_along_axis(near, best, 1)[:, 0], jnp.take_along_axis(way, best, 1)[:, 0]
 
-    def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: Float[Array, "N 2"]) -> Int[Array, "N"]:
+    def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: jax.Array) -> Int[Array, "N"]:
         away = jnp.linalg.norm(points - goal[:, None], axis=-1)
         return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6), -1)
 
-    def _sees(self, maze: Maze, position: Float[Array, "N 2"], points: Float[Array, "N n 2"], radius: float) -> jax.Array:
+    def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "N n 2"], radius: float) -> jax.Array:
         reach = segment_reach(self.look_m, self.radius_m + self.margin_m, self.cell_m)
         reach = max(reach, segment_reach(1.5 * self.look_m, self.radius_m, self.cell_m))
         sight = functools.partial(in_sight, radius=radius, reach=reach)

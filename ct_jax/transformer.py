@@ -1,4 +1,4 @@
-"""Control Transformer: a return-conditioned causal transformer over (return-to-go, state, action) (paper, sec. III-C, E).
+"""Control Transformer: a return-conditioned causal transformer (paper, sec. III-C and E).
 
 The policy is defined as *banded* causal attention: a token of step t attends to tokens of steps t - K + 1 ... t that
 come before it. That is what acting with a key/value cache over a sliding window computes, and training uses the same
@@ -153,7 +153,8 @@ class ControlTransformer(nn.Module):
     ) -> Float[Array, "B S A"]:
         """Predicted actions of all steps of pieces of S steps. Steps that are not ``valid`` must come last."""
         batch, steps = rtg.shape
-        tokens = jnp.stack([self._embed_return(rtg), self._embed_state(maps, proprio, goal), self.embed_action(action)], 2)
+        state = self._embed_state(maps, proprio, goal)
+        tokens = jnp.stack([self._embed_return(rtg), state, self.embed_action(action)], 2)
         x = (tokens + self._embed_time(timestep)[:, :, None]).reshape(batch, TOKENS * steps, -1)
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
         step = jnp.arange(TOKENS * steps) // TOKENS

@@ -2,8 +2,8 @@
 
     python experiments/table.py
 
-No number of the README is typed by hand. A table stands between ``<!-- NAME -->`` and ``<!-- /NAME -->``, NAME being the
-results file without ``.json``.
+No number of the README is typed by hand. A table stands between ``<!-- NAME -->`` and ``<!-- /NAME -->``, NAME being
+the results file without ``.json``.
 """
 
 import json

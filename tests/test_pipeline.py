@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from ct_envs import UserError, load_maze, robots
-from ct_jax import pipeline, run as runs
+from ct_jax import pipeline
+from ct_jax import run as runs
 from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
 from ct_jax.evaluate import METHODS

@@ -212,10 +212,11 @@ class Sac:
             normalizer=running_statistics.update(state.normalizer, observation),
             replay=self._buffer.insert_internal(state.replay, transition),
         )
-        return state, {"reward": reward.mean(), "episodes": over.sum(), "successes": (over * after.info["success"]).sum()}
+        successes = (over * after.info["success"]).sum()
+        return state, {"reward": reward.mean(), "episodes": over.sum(), "successes": successes}
 
     def _reward(self, before: State, after: State) -> jax.Array:
-        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; and the bonus."""
+        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus."""
         robot = self.env.robot
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
         dense = {

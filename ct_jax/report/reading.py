@@ -150,8 +150,6 @@ def _is_row(row: Any) -> bool:
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an archive, or none if it is missing or half-written."""
-    if not path.is_file():
-        return {}
     try:
         # opened here, for NumPy leaves the file of a torn archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:

@@ -159,7 +159,9 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     return walls[::-1]
 
 
-def random_walls(seed: int, *, height: int = 9, width: int = 12, density: float = 1.0, loops: float = 0.3) -> np.ndarray:
+def random_walls(
+    seed: int, *, height: int = 9, width: int = 12, density: float = 1.0, loops: float = 0.3
+) -> np.ndarray:
     """A random maze with one connected free region, bool [height, width], row 0 lowest.
 
     Corridors are carved by a depth-first walk on every second cell; then ``loops`` of the walls that separate two
@@ -292,7 +294,7 @@ def segment_reach(max_length: float, radius: float, cell_m: float = CELL_M) -> i
 def _segment_to_box(
     a: Float[Array, "2"], b: Float[Array, "2"], low: Float[Array, "n 2"], high: Float[Array, "n 2"]
 ) -> Float[Array, "n"]:
-    """Distance [m] between the segment a-b and axis-aligned boxes: 0 if they meet, else an end or a corner is nearest."""
+    """Distance [m] between the segment a-b and axis-aligned boxes: 0, or to an end or a corner."""
 
     along = b - a
     low, high = low - a[None], high - a[None]  # from here on as seen from a
@@ -311,7 +313,8 @@ def _segment_to_box(
     t1, t2 = low / safe, high / safe
     enter = jnp.maximum(jnp.minimum(t1, t2).max(-1), 0.0)
     leave = jnp.minimum(jnp.maximum(t1, t2).min(-1), 1.0)
-    return jnp.where(enter <= leave, 0.0, jnp.minimum(jnp.minimum(to_box(jnp.zeros_like(along)), to_box(along)), to_segment))
+    to_end = jnp.minimum(to_box(jnp.zeros_like(along)), to_box(along))
+    return jnp.where(enter <= leave, 0.0, jnp.minimum(to_end, to_segment))
 
 
 def sample_free(

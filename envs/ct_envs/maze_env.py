@@ -32,9 +32,9 @@ class MazeEnv(Env):
 
     Observation: a dict of ``proprio`` [P] (for the point: its velocity, m/s), ``goal`` [2] (from the robot to the
     goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action: [-1, 1]^nu. An episode ends with success (within the
-    goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon. ``state.info``
-    holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``steps``, ``position``, ``goal``,
-    ``maze``, ``tasks`` and ``key``.
+    goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon.
+    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``steps``, ``position``,
+    ``goal``, ``maze``, ``tasks`` and ``key``.
     """
 
     def __init__(
@@ -164,8 +164,6 @@ class MazeEnv(Env):
         key, now = jax.random.split(info["key"])
         stepped = stepped.replace(info=info | {"key": key})
         fresh = self._begin(now, stepped)  # only what differs is chosen below; the observation is made once
-        goal, steps = (
-            jnp.where(done, fresh.info[name], stepped.info[name]) for name in ("goal", "steps")
-        )
+        goal, steps = (jnp.where(done, fresh.info[name], stepped.info[name]) for name in ("goal", "steps"))
         physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.pipeline_state, physics)
         return self._observe(physics, stepped.replace(info=stepped.info | {"goal": goal, "steps": steps}))

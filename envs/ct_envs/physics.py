@@ -129,9 +129,7 @@ class MjxEngine:
             mocap_pos=walls,
             ctrl=ctrl,
         )
-        data, _ = jax.lax.scan(
-            lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps
-        )
+        data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
 
 
@@ -187,8 +185,6 @@ def static_model(robot: Robot, walls: bytes, height: int, width: int, cell_m: fl
     spec = mujoco.MjSpec.from_string(model_xml(robot))
     grid = np.frombuffer(walls, bool).reshape(height, width)
     for row, column in np.argwhere(grid):
-        body = spec.worldbody.add_body(
-            pos=[(column + 0.5) * cell_m, (row + 0.5) * cell_m, WALL_HEIGHT_M / 2]
-        )
+        body = spec.worldbody.add_body(pos=[(column + 0.5) * cell_m, (row + 0.5) * cell_m, WALL_HEIGHT_M / 2])
         add_wall(body, cell_m)
     return spec.compile()
