@@ -330,11 +330,12 @@ def _single(run: Run, episodes: Episodes, i: int) -> str:
 
 
 def _pick_failures(run: Run, mine: list[Episodes]) -> list[tuple[Episodes, int]]:
-    """Failures of every kind in turn, those in unseen mazes first."""
-    kinds: dict[str, list[tuple[Episodes, int]]] = {kind: [] for kind in words.KINDS}
+    """Failures of every kind in every maze in turn, those in unseen mazes first."""
+    kinds: dict[tuple[str, str], list[tuple[Episodes, int]]] = {}
     for episodes in sorted(mine, key=lambda e: e.seen):
-        for i in np.flatnonzero(~episodes.success):
-            kinds[words.failure_kind(run, episodes, int(i))].append((episodes, int(i)))
+        for i in map(int, np.flatnonzero(~episodes.success)):
+            kind = words.failure_kind(run, episodes, i)
+            kinds.setdefault((episodes.maze, kind), []).append((episodes, i))
     return [pick for picks in zip_longest(*kinds.values()) for pick in picks if pick][:MOST_FAILURES]
 
 
