@@ -46,33 +46,35 @@ class ExplorerGuide:
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
         """Cells of which the local map at ``position`` holds at least one point."""
         offset = (jnp.arange(MAP_CELLS) - (MAP_CELLS - 1) / 2) * self.map_cell_m
-        column, row = jnp.floor((position[:, None] + offset) / maze.cell_m).astype(jnp.int32)
+        column, row = jnp.floor((position[:, None] + offset[None]) / maze.cell_m).astype(jnp.int32)
         height, width = maze.shape
-        rows = jnp.any(row[:, None] == jnp.arange(height), 0)
-        columns = jnp.any(column[:, None] == jnp.arange(width), 0)
+        rows = jnp.any(row[:, None] == jnp.arange(height)[None], 0)
+        columns = jnp.any(column[:, None] == jnp.arange(width)[None], 0)
         return rows[:, None] & columns[None, :]
 
     def _choose(self, believed: Maze, to_go: jax.Array, position: jax.Array, goal: jax.Array) -> jax.Array:
         side = jnp.arange(-2, 3)
         offsets = jnp.stack(jnp.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
-        cells = cell_of(believed, position) + offsets
+        cells = cell_of(believed, position)[None] + offsets
         points = jnp.concatenate([goal[None], (cells[:, ::-1] + 0.5) * believed.cell_m])
         height, width = believed.shape
         on_grid = to_go[jnp.clip(cells[:, 0], 0, height - 1), jnp.clip(cells[:, 1], 0, width - 1)]
         rest = jnp.concatenate([jnp.zeros(1), jnp.where(is_wall(believed, cells), jnp.inf, on_grid)])
-        away = jnp.linalg.norm(points - position, axis=-1)
+        away = jnp.linalg.norm(points - position[None], axis=-1)
         reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
         free = jax.vmap(lambda p: in_sight(believed, position, p, radius=self.radius_m, reach=reach))(points)
+        # Of ways of equal length, the one with the farther waypoint: a robot at a cell's centre must not stay there.
         # If nothing is in sight, the centre of the robot's own cell will do.
         usable = (free & (away <= self.look_m)) | (jnp.arange(len(points)) == 1 + len(offsets) // 2)
-        return points[jnp.argmin(jnp.where(usable, away + rest, jnp.inf))]
+        return points[jnp.argmin(jnp.where(usable, 0.999 * away + rest, jnp.inf))]
 
 
 def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
     """Way [m] from cell centres to goals [N, 2] (m), over 4-connected cells that are not wall (value iteration)."""
     height, width = maze.shape
     cell = jax.vmap(cell_of)(maze, goal)
-    at_goal = (jnp.arange(height)[:, None] == cell[:, :1, None]) & (jnp.arange(width) == cell[:, 1:, None])
+    rows, columns = jnp.arange(height)[None, :, None], jnp.arange(width)[None, None]
+    at_goal = (rows == cell[:, :1, None]) & (columns == cell[:, 1:, None])
     last = jnp.linalg.norm((cell[:, ::-1] + 0.5) * maze.cell_m[:, None] - goal, axis=-1)
     cost = jnp.where(maze.walls, jnp.inf, maze.cell_m[:, None, None])
     start = jnp.where(at_goal, last[:, None, None], jnp.inf)

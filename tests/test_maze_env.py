@@ -199,7 +199,7 @@ def test_collision_is_told_while_a_wall_is_touched(wall_distance):
     state = reset(keys(7), LARGE, None)
     told = []
     for _ in range(30):
-        state = step(state.replace(info=state.info | {"steps": jnp.zeros(N, jnp.int32)}), jnp.ones((N, 2)))
+        state = step(state.replace(info=state.info | {"episode_steps": jnp.zeros(N, jnp.int32)}), jnp.ones((N, 2)))
         distance = wall_distance(load_walls("antmaze-large"), state.info["position"])
         clear = np.abs(distance - POINT.radius_m) > 1e-4
         told.append(np.asarray(state.info["collision"]))
@@ -259,9 +259,9 @@ def test_auto_reset_tells_of_the_finished_episode_and_begins_a_fresh_one(wall_di
         np.testing.assert_array_equal(after.done, plain.done)
         np.testing.assert_allclose(after.reward, plain.reward, rtol=1e-5)
         done = np.asarray(after.done) > 0
-        pick = lambda state: (state.pipeline_state, state.obs, state.info["goal"], state.info["steps"])  # noqa: E731
+        pick = lambda state: (state.pipeline_state, state.obs, state.info["goal"], state.info["episode_steps"])  # noqa: E731
         assert_same(*(jax.tree.map(lambda x: x[~done], pick(s)) for s in (after, plain)), atol=1e-5)  # noqa: B023
-        assert (np.asarray(after.info["steps"])[done] == 0).all()
+        assert (np.asarray(after.info["episode_steps"])[done] == 0).all()
         assert (np.asarray(after.pipeline_state.qvel)[done] == 0).all()
         np.testing.assert_allclose(after.obs["goal"], after.info["goal"] - after.info["position"], atol=1e-5)
         assert wall_distance(load_walls("antmaze-umaze"), after.info["position"]).min() >= POINT.radius_m - 0.1
@@ -274,7 +274,7 @@ def test_every_auto_reset_draws_a_fresh_start_and_goal():
     step, state = compiled(horizon=HORIZON), reset(keys(12), LARGE, None)
     starts, goals = [state.info["position"]], [state.info["goal"]]
     for _ in range(6):
-        state = step(state.replace(info=state.info | {"steps": jnp.full(N, HORIZON - 1)}), jnp.zeros((N, 2)))
+        state = step(state.replace(info=state.info | {"episode_steps": jnp.full(N, HORIZON - 1)}), jnp.zeros((N, 2)))
         assert (state.done == 1).all()
         starts.append(state.info["position"])
         goals.append(state.info["goal"])
@@ -286,7 +286,7 @@ def test_the_horizon_truncates():
     step, state = compiled(horizon=HORIZON, auto_reset=False), reset(keys(13), UMAZE, far(NEAR))
     for i in range(1, HORIZON + 1):
         state = step(state, jnp.zeros((N, 2)))
-        assert (state.info["steps"] == i).all()
+        assert (state.info["episode_steps"] == i).all()
         assert (state.done == (i == HORIZON)).all()
         assert (state.info["truncation"] == (i == HORIZON)).all()
         assert (state.info["success"] == 0).all()
@@ -325,7 +325,7 @@ def test_without_auto_reset_a_finished_environment_stays_as_it_is():
         done = np.asarray(state.done) > 0
         assert_same(*(jax.tree.map(lambda leaf: leaf[done], s) for s in (state, after)))  # noqa: B023
         state = after
-    assert (state.done == 1).all() and len(set(np.asarray(state.info["steps"]).tolist())) > 1
+    assert (state.done == 1).all() and len(set(np.asarray(state.info["episode_steps"]).tolist())) > 1
 
 
 @pytest.mark.rank_promotion("allow")  # MJX
@@ -351,7 +351,7 @@ def test_a_nan_ends_its_episode_and_no_other(monkeypatch, tmp_path, engine, what
         assert (after.done == 0).all()
         jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), after.obs)
         assert np.isfinite(after.reward).all()
-    assert after.info["steps"][3] == HORIZON - 2 and after.info["steps"][0] == HORIZON - 1
+    assert after.info["episode_steps"][3] == HORIZON - 2 and after.info["episode_steps"][0] == HORIZON - 1
 
 
 def test_a_nan_action_without_auto_reset_leaves_a_finite_state(monkeypatch, tmp_path):

@@ -94,7 +94,7 @@ def test_what_is_no_run_is_refused(tmp_path):
 
 
 def test_an_unknown_zoo_model_lists_the_known():
-    names = ", ".join("zoo:" + name for name in zoo_names()) or "none"
+    names = ", ".join("zoo:" + name for name in zoo_names()) or "zoo:NAME"
     with pytest.raises(UserError, match=f"no model 'zoo:unicorn' in the zoo; models: {names}"):
         load_model("zoo:unicorn")
     with pytest.raises(UserError):

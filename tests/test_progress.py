@@ -65,7 +65,9 @@ def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
     metrics.log("fit", 20, loss=0.5)
     metrics.log("fit", 40, loss=math.nan, rate=2)
     metrics.close()
-    lines = [json.loads(line, parse_constant=pytest.fail) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line, parse_constant=pytest.fail) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
+    ]
     assert [(line["stage"], line["step"], line["loss"]) for line in lines] == [("fit", 20, 0.5), ("fit", 40, None)]
     assert list((tmp_path / "tensorboard").glob("events.*"))
 

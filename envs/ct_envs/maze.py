@@ -68,7 +68,7 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
     if not (padded[[0, -1]].all() and padded[:, [0, -1]].all()):
         raise UserError("maze is free at the border; close it with walls")
 
-    labels, _ = ndimage.label(~padded)
+    labels, _ = _regions(~padded)
     flat = np.flatnonzero(~padded)
     flat = flat[np.argsort(labels.ravel()[flat], kind="stable")]
     label = labels.ravel()[flat]
@@ -85,6 +85,11 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
         n_free=jnp.asarray(n, jnp.int32),
         cell_m=jnp.asarray(cell_m, jnp.float32),
     )
+
+
+def _regions(free: np.ndarray) -> tuple[np.ndarray, int]:
+    """Label the 4-connected regions of free cells from 1; 0 is wall. And how many there are."""
+    return ndimage.label(free)  # pyright: ignore
 
 
 def stack_mazes(mazes: list[Maze]) -> Maze:
@@ -205,7 +210,7 @@ def random_walls(
     separating[1:-1, 1:-1] &= sides
     walls[separating & (rng.random(walls.shape) < loops)] = False
     walls[walls & inner & (rng.random(walls.shape) > density)] = False
-    labels, count = ndimage.label(~walls)
+    labels, count = _regions(~walls)
     if count > 1:  # thinning may open cells that touch nothing: fill all but the largest region
         sizes = ndimage.sum_labels(~walls, labels, range(1, count + 1))
         walls = labels != 1 + int(np.argmax(sizes))

@@ -33,7 +33,7 @@ class MazeEnv(Env):
     Observation: a dict of ``proprio`` [P] (for the point: its velocity, m/s), ``goal`` [2] (from the robot to the
     goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action: [-1, 1]^nu. An episode ends with success (within the
     goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon.
-    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``steps``, ``position``,
+    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``episode_steps``, ``position``,
     ``goal``, ``maze``, ``tasks`` and ``key``.
     """
 
@@ -108,7 +108,7 @@ class MazeEnv(Env):
         """The first state of an episode, in the maze and with the tasks of ``state``."""
         start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
         physics = self._initial_physics(jax.random.fold_in(key, 1), start)
-        info = state.info | {"goal": goal, "steps": jnp.zeros((), jnp.int32)}
+        info = state.info | {"goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
         return self._observe(physics, state.replace(info=info))
 
     def _draw_task(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> tuple[jax.Array, jax.Array]:
@@ -146,13 +146,13 @@ class MazeEnv(Env):
         info = dict(state.info)
         position = physics.qpos[:2]
         distance = jnp.linalg.norm(info["goal"] - position)
-        steps = info["steps"] + 1
+        steps = info["episode_steps"] + 1
         success = finite & (distance < self.robot.goal_tolerance_m)
         collision = clearance(info["maze"], position) < self.robot.radius_m
         over = steps >= self.horizon
         done = success | ~finite | over
         info |= {
-            "steps": steps,
+            "episode_steps": steps,
             "success": success.astype(jnp.float32),
             "collision": collision.astype(jnp.float32),
             "truncation": (over & ~success & finite).astype(jnp.float32),
@@ -164,6 +164,6 @@ class MazeEnv(Env):
         key, now = jax.random.split(info["key"])
         stepped = stepped.replace(info=info | {"key": key})
         fresh = self._begin(now, stepped)  # only what differs is chosen below; the observation is made once
-        goal, steps = (jnp.where(done, fresh.info[name], stepped.info[name]) for name in ("goal", "steps"))
+        goal, steps = (jnp.where(done, fresh.info[name], stepped.info[name]) for name in ("goal", "episode_steps"))
         physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.pipeline_state, physics)
-        return self._observe(physics, stepped.replace(info=stepped.info | {"goal": goal, "steps": steps}))
+        return self._observe(physics, stepped.replace(info=stepped.info | {"goal": goal, "episode_steps": steps}))

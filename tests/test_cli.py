@@ -1,0 +1,349 @@
+"""The command line as other tools rely on it: what it takes, what it prints, and one line for bad input."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ct_envs.maze import maze_names
+from ct_jax import __version__, cli, pipeline
+from ct_jax.cli import main
+
+pytestmark = pytest.mark.rank_promotion("allow")
+
+ROOT = Path(__file__).parents[1]
+ROW = (
+    "robot", "method", "maze", "episodes", "seed", "success_rate", "success_ci95", "return_mean", "return_scaled",
+    "spl", "collision_rate", "timeout_rate", "steps_mean", "wall_s",
+)  # fmt: skip
+
+
+def shell(*arguments, **options):
+    """Run ``python ...`` as a person would, in a process of its own."""
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
+    environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"} | options.pop("env", {})
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment, **options)
+
+
+def refused(capsys, *arguments):
+    """The one line with which a command is refused."""
+    capsys.readouterr()
+    assert main([str(each) for each in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("error: ") and "Traceback" not in err
+    return err
+
+
+# ---------------------------------------------------------------------------------------------------- the commands
+
+
+def test_train_prints_the_table_and_where_things_are(tiny_run):
+    lines = tiny_run.stdout.splitlines()
+    assert lines[0].split()[:3] == ["maze", "method", "success"]
+    assert [line.split()[0] for line in lines[1:7]] == ["islands"] * 3 + ["antmaze-umaze"] * 3
+    assert lines[-2:] == [f"model:  {tiny_run.folder / 'model'}", f"report: {tiny_run.folder / 'report.html'}"]
+    assert "controller: done in" in tiny_run.stderr and "\x1b" not in tiny_run.stdout + tiny_run.stderr
+
+
+def test_json_is_the_only_thing_on_stdout(tiny_run, islands):
+    """Through a real process, where libraries print what they like."""
+    done = shell(
+        "-m", "ct_jax.cli", "evaluate", str(tiny_run.folder), "--maze", str(islands), "--episodes", "2", "--seed", "3",
+        "--method", "planner", "--json", env={"XDG_CACHE_HOME": str(tiny_run.folder.parent / "cache")},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    row = json.loads(done.stdout, parse_constant=pytest.fail)
+    assert done.stdout.count("\n") == 1 and row.keys() >= set(ROW)
+    head = {"robot": "point", "method": "planner", "maze": str(islands), "episodes": 2, "seed": 3}
+    assert row | head == row
+    assert 0 <= row["success_ci95"][0] <= row["success_rate"] <= row["success_ci95"][1] <= 1
+
+
+@pytest.mark.parametrize("method", ["ct", "planner", "explorer"])
+def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
+    """The same seed means the same pairs, in the run and afterwards."""
+    whole = [r for r in pipeline.results(tiny_run.folder) if (r["maze"], r["method"]) == ("antmaze-umaze", method)]
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4", "--method", method]
+    assert main([*command, "--json"]) == 0
+    row = json.loads(capsys.readouterr().out)
+    for name in set(ROW) - {"wall_s"}:
+        assert row[name] == pytest.approx(whole[0][name]), name
+
+
+def test_evaluate_prints_a_table_for_people(tiny, tiny_run, capsys):
+    assert main(["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and lines[1].split()[:2] == ["antmaze-umaze", "ct"]
+
+
+def test_report_is_written_again(tiny, tiny_run, tmp_path, capsys):
+    folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
+    (folder / "report.html").unlink()
+    assert main(["report", str(folder)]) == 0
+    assert capsys.readouterr().out == f"{folder / 'report.html'}\n" and (folder / "report.html").is_file()
+
+
+def test_mazes_shows_every_maze(capsys):
+    assert main(["mazes"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in maze_names()) and "██" in out
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"ct-jax {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ([], ["train", "evaluate", "report", "mazes", "examples:", "ct-jax train point --preset demo"]),
+        (["train"], ["ROBOT", "--preset", "--out", "--seed", "--maze", "--eval-maze", "--engine", "--resume"]),
+        (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
+        (["evaluate"], ["RUN", "--maze", "--episodes", "--seed", "--method", "--json", "zoo:point", "examples:"]),
+        (["report"], ["RUN", "ct-jax report runs/demo"]),
+        (["mazes"], ["ct-jax mazes"]),
+    ],
+)
+def test_help_teaches(command, words, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--help"])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 0 and err == ""
+    assert [word for word in words if word not in out] == []
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["mazes"], ["train", "bob"], ["train"]])
+def test_what_needs_no_physics_does_not_wait_for_it(arguments):
+    heavy = ["mujoco", "brax", "orbax", "tensorboardX", "matplotlib"] + ["jax"] * (arguments != ["mazes"])
+    code = f"""
+import sys
+from ct_jax import cli
+try:
+    status = cli.main({arguments!r})
+except SystemExit as stop:
+    status = stop.code
+print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
+    done = shell("-c", code)
+    assert done.stdout.splitlines()[-1] in ("heavy: 0 []", "heavy: 2 []"), done.stdout + done.stderr
+
+
+# --------------------------------------------------------------------------------------------------- bad arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["give a command", "train, evaluate, report, mazes"]),
+        (["bogus"], ["bogus", "--help"]),
+        (["train"], ["missing", "ROBOT", "ct-jax train --help"]),
+        (["evaluate"], ["missing", "RUN", "ct-jax evaluate --help"]),
+        (["train", "point", "extra"], ["extra"]),
+        (["train", "point", "--preset"], ["--preset"]),
+        (["train", "point", "--sneed", "3"], ["--sneed", "ct-jax train --help"]),
+        (["train", "point", "--seed", "many"], ["--seed", "'many'", "whole number"]),
+        (["train", "point", "--seed", "-1"], ["--seed -1", "0 to"]),
+        (["train", "point", "--seed", str(2**70)], ["--seed", "0 to"]),
+        (["train", "bob"], ["no robot named 'bob'", "point"]),
+        (["train", "point", "--preset", "huge"], ["no preset named 'huge'", "cpu, demo", "paper"]),
+        (["train", "point", "--engine", "warp"], ["no engine named 'warp'", "auto, mjx, mujoco"]),
+        (["train", "point", "--maze", "atlantis"], ["'atlantis'", "antmaze-large", "hall"]),
+        (["train", "point", "--eval-maze", "atlantis"], ["'atlantis'", "antmaze-large", "hall"]),
+        (["evaluate", "RUN", "--maze", "atlantis"], ["'atlantis'", "antmaze-large"]),
+        (["evaluate", "RUN", "--method", "luck"], ["no method named 'luck'", "ct, planner, explorer"]),
+        (["evaluate", "RUN", "--engine", "warp"], ["no engine named 'warp'", "auto, mjx, mujoco"]),
+        (["evaluate", "RUN", "--episodes", "0"], ["--episodes 0", "from 1"]),
+        (["evaluate", "RUN", "--episodes", "-5"], ["--episodes -5", "from 1"]),
+        (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
+        (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
+        (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
+        (["evaluate", "zoo:nobody"], ["zoo:nobody", "models: zoo:"]),
+        (["evaluate", "nowhere"], ["nowhere: no run folder", "ct-jax train"]),
+        (["report", "nowhere"], ["nowhere"]),
+    ],
+)
+def test_bad_arguments_are_named_with_the_mend(arguments, words, tiny, tiny_run, capsys):
+    line = refused(capsys, *(str(tiny_run.folder) if each == "RUN" else each for each in arguments))
+    assert [word for word in words if word not in line] == [], line
+
+
+def test_a_real_process_says_one_line_too():
+    done = shell("-m", "ct_jax.cli", "train", "point", "--preset", "huge", env={"XDG_CACHE_HOME": "/dev/null"})
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith("error: no preset named 'huge'")
+
+
+# ------------------------------------------------------------------------------------------------------- bad mazes
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"####\n#.#\n####\n", [":2: ", "3 cells", "make all lines equal"]),
+        (b"", ["empty"]),
+        (b"\n\n", ["empty"]),
+        (b"####\n####\n####\n", ["no free cell", "'.'"]),
+        (b"####\n#...\n####\n", [":2: ", "column 4", "close"]),
+        (b"####\n#x.#\n####\n", [":2: ", "'x'"]),
+        (b"####\n#.\xff#\n####\n", [":2: ", "not UTF-8"]),
+        (10_000, ["too large", "1024 x 1024"]),
+    ],
+    ids=["ragged", "empty", "blank", "all-wall", "unclosed", "letter", "not-utf8", "10000x10000"],
+)
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_bad_maze_files_are_named_with_line_and_mend(command, content, words, tiny, tiny_run, tmp_path, capsys):
+    file = tmp_path / "floor.txt"
+    if isinstance(content, int):
+        with file.open("wb") as opened:
+            opened.truncate(content * (content + 1))
+    else:
+        file.write_bytes(content)
+    given = ["train", "point", "--out", tmp_path / "run"] if command == "train" else ["evaluate", tiny_run.folder]
+    line = refused(capsys, *given, "--maze", file)
+    assert str(file) in line and [word for word in words if word not in line] == [], line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_is_no_maze(tiny, tmp_path, capsys):
+    assert str(tmp_path) in refused(capsys, "train", "point", "--maze", tmp_path)
+
+
+def test_a_maze_that_cannot_be_read(tiny, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "floor.txt"
+    file.write_text("###\n#.#\n###\n")
+
+    def denied(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    line = refused(capsys, "train", "point", "--maze", file)
+    assert str(file) in line and "Permission denied" in line
+
+
+def test_crlf_and_trailing_blank_lines_are_simply_read(tiny, tiny_run, islands, tmp_path, capsys):
+    file = tmp_path / "floor.txt"
+    file.write_bytes(islands.read_bytes().replace(b"\n", b"\r\n") + b"\r\n\r\n")
+    rows = []
+    for maze in (islands, file):
+        assert main(["evaluate", str(tiny_run.folder), "--maze", str(maze), "--episodes", "4", "--json"]) == 0
+        rows.append(json.loads(capsys.readouterr().out) | {"wall_s": 0, "maze": ""})
+    assert rows[0] == rows[1]
+
+
+# ----------------------------------------------------------------------------------------------------- bad folders
+
+
+def test_out_must_be_a_folder_that_can_be_used(tiny, tmp_path, capsys):
+    command = ["train", "point", "--preset", "tiny", "--maze", "antmaze-umaze", "--out"]
+    file, other = tmp_path / "file", tmp_path / "other"
+    file.write_text("mine")
+    other.mkdir()
+    (other / "thesis.tex").write_text("mine")
+    for out, word in ((file, "a file"), (file / "below", "Not a directory"), (other, "not empty and no run folder")):
+        line = refused(capsys, *command, out)
+        assert str(out) in line and word in line and "--out" in line
+    assert [path.name for path in other.iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_is_not_begun_twice(tiny, tiny_run, capsys):
+    out = ["--out", tiny_run.folder]
+    assert "--resume" in refused(capsys, *tiny_run.arguments, *out)
+    assert "seed 0, not 5" in refused(capsys, *tiny_run.arguments, *out, "--resume", "--seed", "5")
+    other = ["train", "point", "--preset", "tiny", "--maze", "hall", *out, "--resume"]
+    assert "mazes islands, not hall" in refused(capsys, *other)
+
+
+def test_an_unfinished_run_has_no_model_yet(tiny, tiny_run, tmp_path, capsys):
+    folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
+    shutil.rmtree(folder / "model")
+    line = refused(capsys, "evaluate", folder)
+    assert "not trained to the end" in line and f"--out {folder} --resume" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda text: text[: len(text) // 2], "not JSON"),
+        (lambda text: "[]", "not a JSON object"),
+        (lambda text: "{}", "'robot'"),
+        (lambda text: text.replace('"point"', '"bob"'), "no robot named 'bob'"),
+        (lambda text: text.replace('"layers"', '"lawyers"'), "another version"),
+    ],
+)
+def test_a_damaged_model_is_named_with_the_mend(change, word, tiny, tiny_run, tmp_path, capsys):
+    folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
+    file = folder / "model" / "model.json"
+    file.write_text(change(file.read_text()))
+    line = refused(capsys, "evaluate", folder)
+    assert str(file) in line and word in line and "delete" in line
+
+
+def test_a_full_disk_is_one_line_and_keeps_what_is_there(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+    folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
+    (folder / "evaluate" / "done.json").unlink()
+    (folder / "evaluate" / "islands-ct.json").unlink()
+
+    def full(file, **arrays):
+        raise OSError(errno.ENOSPC, "No space left on device", str(file))
+
+    command = [*tiny_run.arguments, "--out", str(folder), "--resume"]
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", full)
+        capsys.readouterr()
+        assert main(command) == 2
+    err = capsys.readouterr().err
+    assert err.splitlines()[-1].startswith("error: ") and "No space left" in err and "Traceback" not in err
+    assert main(command) == 0
+
+
+def test_weights_that_do_not_fit_on_the_disk(tmp_path, monkeypatch):
+    from safetensors import SafetensorError
+
+    from ct_envs import UserError
+    from ct_jax import checkpoint
+
+    def full(arrays, file):
+        Path(file).write_bytes(b"half")
+        raise SafetensorError("I/O error: No space left on device")
+
+    file = tmp_path / "weights.safetensors"
+    checkpoint.save_weights(file, {"a": np.ones(3, np.float32)})
+    whole = file.read_bytes()
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(UserError, match="No space left"):
+        checkpoint.save_weights(file, {"a": np.zeros(3, np.float32)})
+    assert file.read_bytes() == whole and list(tmp_path.iterdir()) == [file]
+
+
+# ---------------------------------------------------------------------------------------------------- interruption
+
+
+def test_ctrl_c_is_130_and_a_line(monkeypatch, capsys):
+    def stop(command):
+        raise KeyboardInterrupt
+
+    for name in ("_mazes", "_train"):
+        monkeypatch.setattr(cli, name, stop)
+    assert main(["mazes"]) == cli.INTERRUPTED == 130
+    assert main(["train", "point", "--out", "runs/my run"]) == 130
+    out, err = capsys.readouterr()
+    assert out == "" and err.splitlines()[0] == "stopped; run it again"
+    assert err.splitlines()[1].endswith("continue with: ct-jax train point --out 'runs/my run' --resume")
+
+
+def test_a_closed_pipe_is_no_error():
+    code = "import sys; from ct_jax.cli import main; sys.exit(main(['mazes']))"
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": paths}
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
