@@ -67,12 +67,12 @@ DEMO = replace(
     CPU,
     sac=SacConfig(iterations=400),
     collect=replace(CPU.collect, trajectories=500),
-    fit=replace(_LIFTED, updates=300),
-    value=ValueConfig(fit=replace(CPU.value.fit, updates=600)),
+    fit=replace(_LIFTED, updates=340),
+    value=ValueConfig(fit=replace(CPU.value.fit, updates=800)),
     recover=replace(CPU.recover, recoveries=200),
-    rounds=2,
-    round_fit=replace(_LIFTED, updates=150, warmup=20),
-    last_fit=replace(_LIFTED, updates=300, warmup=20, decay=True),
+    rounds=3,
+    round_fit=replace(_LIFTED, updates=120, warmup=20),
+    last_fit=replace(_LIFTED, updates=460, warmup=20, decay=True),
 )
 """The same in minutes."""
 
