@@ -17,6 +17,7 @@ from ct_envs import UserError
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
+_DISK_ERRORS = ("RESOURCE_EXHAUSTED", "PERMISSION_DENIED", "No space left")
 
 
 def _is_key(leaf: Any) -> bool:
@@ -38,13 +39,21 @@ class Checkpoints:
         self._every_s, self._last = every_s, time.monotonic()
 
     def save(self, step: int, state: Any) -> None:
-        """Write a state and wait until it is on disk."""
+        """Write a state and wait until it is on disk. Raises UserError if the disk is full or may not be written to."""
         if step in self._manager.all_steps():
             return
         plain = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
         leaves = {str(i): leaf for i, leaf in enumerate(jax.tree.leaves(plain))}
-        self._manager.save(step, args=ocp.args.StandardSave(leaves))  # pyright: ignore[reportCallIssue]
-        self._manager.wait_until_finished()
+        try:
+            self._manager.save(step, args=ocp.args.StandardSave(leaves))  # pyright: ignore[reportCallIssue]
+            self._manager.wait_until_finished()
+        except ValueError as bad:  # as tensorstore calls a full disk
+            if not any(word in str(bad) for word in _DISK_ERRORS):
+                raise
+            reason = "no permission" if "PERMISSION" in str(bad) else "no space left"
+            raise UserError(
+                f"{self._folder}: cannot be written ({reason}); make room, then go on with --resume"
+            ) from None
         self._last = time.monotonic()
 
     def maybe_save(self, step: int, state: Any) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io
 import json
+import logging
 import operator
 import os
 import re
@@ -207,6 +208,7 @@ def prepare_jax() -> None:
 
         import ct_jax.pipeline  # noqa: F401
         from ct_jax.run import cores
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs what it also raises, in hundreds of lines
     # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning

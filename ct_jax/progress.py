@@ -9,7 +9,9 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.summary import scalar
 
 from ct_jax.interrupts import raise_if_interrupted
 
@@ -71,13 +73,17 @@ class Bar:
 
 
 class Metrics:
-    """Scalars of a run, appended to ``metrics.jsonl`` and to TensorBoard's files in ``tensorboard/``."""
+    """Scalars of a run, appended to ``metrics.jsonl`` and to TensorBoard's files in ``tensorboard/``.
+
+    Both are written at once: TensorBoard's usual writer has a thread of its own, and hangs when the disk is full.
+    """
 
     def __init__(self, run: Path):
-        file = run / "metrics.jsonl"
+        file, board = run / "metrics.jsonl", run / "tensorboard"
         _drop_half_line(file)
+        board.mkdir(exist_ok=True)
         self._file = file.open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(run / "tensorboard"))
+        self._board = EventsWriter(str(board / "events"))
         self._begun = time.monotonic()
 
     def log(self, stage: str, step: int, **values: float) -> None:
@@ -85,15 +91,19 @@ class Metrics:
         record: dict[str, str | float | None] = {"stage": stage, "step": step}
         record["time_s"] = round(time.monotonic() - self._begun, 3)
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
-        record |= dict.fromkeys(values) | finite
-        self._file.write(json.dumps(record) + "\n")
+        self._file.write(json.dumps(record | dict.fromkeys(values) | finite) + "\n")
         self._file.flush()
         for name, value in finite.items():
-            self._board.add_scalar(f"{stage}/{name}", value, step)
+            summary = scalar(f"{stage}/{name}", value)
+            self._board.write_event(Event(wall_time=time.time(), step=step, summary=summary))
+        self._board.flush()
 
     def close(self) -> None:
-        self._file.close()
-        self._board.close()
+        """Close both files."""
+        try:
+            self._file.close()
+        finally:
+            self._board.close()
 
 
 def _drop_half_line(file: Path) -> None:

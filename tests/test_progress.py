@@ -1,8 +1,10 @@
 """Progress and logs: what a person sees with and without a terminal, and files that stay readable."""
 
+import contextlib
 import io
 import json
 import math
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -65,11 +67,21 @@ def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
     metrics.log("fit", 20, loss=0.5)
     metrics.log("fit", 40, loss=math.nan, rate=2)
     metrics.close()
-    lines = [
-        json.loads(line, parse_constant=pytest.fail) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()
-    ]
+    text = (tmp_path / "metrics.jsonl").read_text()
+    lines = [json.loads(line, parse_constant=pytest.fail) for line in text.splitlines()]
     assert [(line["stage"], line["step"], line["loss"]) for line in lines] == [("fit", 20, 0.5), ("fit", 40, None)]
-    assert list((tmp_path / "tensorboard").glob("events.*"))
+    (events,) = (tmp_path / "tensorboard").glob("events.*")
+    assert b"fit/loss" in events.read_bytes()
+
+
+def test_a_full_disk_is_an_error_and_no_hang(tmp_path):
+    metrics = Metrics(tmp_path)
+    metrics._file.close()
+    metrics._file = Path("/dev/full").open("w")  # noqa: SIM115
+    with pytest.raises(OSError, match="No space left"):
+        metrics.log("fit", 1, loss=0.5)
+    with contextlib.suppress(OSError):
+        metrics.close()
 
 
 def test_metrics_go_on_after_a_half_line(tmp_path):
