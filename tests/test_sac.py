@@ -108,7 +108,7 @@ def test_the_replay_holds_what_happened(sac, fresh):
         seen, now = (np.concatenate([s.env.obs["proprio"], s.env.obs["goal"]], -1) for s in (before, state))
         rows.append((seen, now, np.asarray(state.env.done), np.asarray(state.env.info["truncation"])))
     data = np.asarray(state.replay.data)[: 3 * TINY.envs]
-    unflatten = jax.vmap(sac._buffer._unflatten_fn)
+    unflatten = sac._buffer._unflatten_fn  # of rows, each a flat transition
     kept = unflatten(data)
     for i, (seen, now, done, truncation) in enumerate(rows):
         part = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i * TINY.envs : (i + 1) * TINY.envs], kept)
