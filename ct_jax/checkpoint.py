@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -92,6 +93,40 @@ class Checkpoints:
 
 def _text(error: Exception) -> str:
     return error.strerror or str(error) if isinstance(error, OSError) else str(error)
+
+
+def run_to(
+    total: int,
+    state: Tree,
+    train: Callable[[Tree, int], tuple[Tree, Any]],
+    count: Callable[[Tree], int],
+    on_progress: Callable[[int, Any], None],
+    checkpoints: Checkpoints | None,
+    chunk: int,
+) -> Tree:
+    """Train a state until it has counted to ``total``: the one loop of all trainings.
+
+    Args:
+        train: takes a state and a number of steps to the state after them and what to report.
+        count: how many steps a state has behind it.
+        on_progress: told (steps done, report) after every ``chunk`` steps.
+        checkpoints: where to go on from, and where to save now and then and when interrupted.
+    """
+    if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
+        state = found[1]
+    done = count(state)
+    try:
+        while done < total:
+            state, report = train(state, min(chunk, total - done))
+            done = count(state)
+            on_progress(done, report)
+            if checkpoints is not None:
+                checkpoints.maybe_save(done, state)
+    except KeyboardInterrupt:
+        if checkpoints is not None:
+            checkpoints.save(done, state)
+        raise
+    return state
 
 
 def _name(path: tuple[Any, ...]) -> str:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ct_envs import UserError
 from ct_envs.maze import Maze
-from ct_jax.checkpoint import Checkpoints
+from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.trajectories import Trajectories, Window, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
@@ -196,22 +196,12 @@ def fit(
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, params)
-    if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
-        state = found[1]
     # A dataset that grows from round to round compiles anew only when it outgrows these.
     data = pad(data, -(-data.n // 1024) * 1024, -(-data.position.shape[1] // 256) * 256)
     place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
-    done = int(state.update)
-    try:
-        while done < learner.config.updates:
-            state, loss = learner.train(state, data, rtg, mazes, min(chunk, learner.config.updates - done))
-            done = int(state.update)
-            on_progress(done, float(loss))
-            if checkpoints is not None:
-                checkpoints.maybe_save(done, state)
-    except KeyboardInterrupt:
-        if checkpoints is not None:
-            checkpoints.save(done, state)
-        raise
+    state = run_to(
+        learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
+        lambda state: int(state.update), lambda done, loss: on_progress(done, float(loss)), checkpoints, chunk,
+    )  # fmt: skip
     return jax.device_get(state.params)

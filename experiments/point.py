@@ -3,8 +3,8 @@
     python experiments/point.py [--preset cpu|demo|paper] [--seeds 0]
 
 With ``--preset cpu`` (two cores, 50 minutes) each row of ``VARIANTS`` is trained: the method as published at the CPU's
-size, and the preset itself, which is what ``zoo:point`` ships; expect 100 % and 92 % of it. All of them meet the same 100
-start-goal pairs. Writes ``experiments/results/point-PRESET.json``.
+size, and the preset itself, which is what ``zoo:point`` ships; expect 100 % and 92 % of it. All of them meet the same
+100 start-goal pairs. Writes ``experiments/results/point-PRESET.json``.
 """
 
 import sys

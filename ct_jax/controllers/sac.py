@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze
-from ct_jax.checkpoint import Checkpoints
+from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.prm import Roadmap
 from ct_jax.rollout import Action, Controller, act_as_meant, rollout
 
@@ -301,20 +301,11 @@ def train_controller(
     env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
     sac = Sac(env, config)
     state = sac.create(train_key, maze, train_tasks)
-    if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
-        state = found[1]
-    done = int(state.iteration)
-    try:
-        while done < config.iterations:
-            state, metrics = sac.train(state, min(chunk, config.iterations - done))
-            done = int(state.iteration)
-            on_progress(done, {name: float(value) for name, value in metrics.items()})
-            if checkpoints is not None:
-                checkpoints.maybe_save(done, state)
-    except KeyboardInterrupt:
-        if checkpoints is not None:
-            checkpoints.save(done, state)
-        raise
+    state = run_to(
+        config.iterations, state, sac.train, lambda state: int(state.iteration),
+        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        checkpoints, chunk,
+    )  # fmt: skip
     act = SacController(state.normalizer, state.policy, env.action_size, config.hidden)
     test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
     return act, edge_success(test_env, act, maze, test_tasks, test_key)

@@ -33,8 +33,8 @@ class MazeEnv(Env):
     Observation: a dict of ``proprio`` [P] (for the point: its velocity, m/s), ``goal`` [2] (from the robot to the
     goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action: [-1, 1]^nu. An episode ends with success (within the
     goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon.
-    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``episode_steps``, ``position``,
-    ``goal``, ``maze``, ``tasks`` and ``key``.
+    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``episode_steps``,
+    ``position``, ``goal``, ``maze``, ``tasks`` and ``key``.
     """
 
     def __init__(
