@@ -330,8 +330,7 @@ def print_rows(rows: list[Row]) -> None:
         table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(show(row) for show in _COLUMNS.values()))
-    console = Console()
-    console.print(table, width=None if console.is_terminal else 120)
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 
 if __name__ == "__main__":

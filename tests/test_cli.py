@@ -174,7 +174,7 @@ def test_bad_arguments_are_named_with_the_mend(arguments, words, tiny, tiny_run,
 
 
 def test_a_real_process_says_one_line_too():
-    done = shell("-m", "ct_jax.cli", "train", "point", "--preset", "huge", env={"XDG_CACHE_HOME": "/dev/null"})
+    done = shell("-m", "ct_jax.cli", "train", "point", "--preset", "huge", env={"XDG_CACHE_HOME": os.devnull})
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     assert done.stderr.startswith("error: no preset named 'huge'")
 
