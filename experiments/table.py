@@ -15,25 +15,26 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 
 
-def percent(rate: float, interval: list[float]) -> str:
-    """A rate with its interval."""
-    return f"{100 * rate:.0f} ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
+def percent(row: dict[str, Any], name: str) -> str:
+    """A rate in percent with its interval."""
+    low, high = row[f"{name}_ci95"]
+    return f"{100 * row[f'{name}_rate']:.0f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def mean(value: float, interval: list[float], digits: int) -> str:
+    """A mean with its interval."""
+    return f"{value:.{digits}f} ({interval[0]:.{digits}f} to {interval[1]:.{digits}f})"
 
 
 def experiment_table(results: dict[str, Any]) -> list[str]:
-    """Methods down, mazes across: success with interval, SPL, scaled return."""
+    """One line for each maze, model and method, with 95 % intervals."""
     rows = results["rows"]
-    mazes = list(dict.fromkeys((row["maze"], row["seen"]) for row in rows))
-    head = ["model", "method"]
-    for maze, seen in mazes:
-        head += [f"{maze} ({'seen' if seen else 'unseen'}): success %", "SPL", "return / 100", "collided %"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for key in dict.fromkeys((row["variant"], row["model_seed"], row["method"]) for row in rows):
-        cells = [f"{key[0]}, seed {key[1]}", key[2]]
-        for maze, _ in mazes:
-            row = next(r for r in rows if (r["variant"], r["model_seed"], r["method"]) == key and r["maze"] == maze)
-            cells += [percent(row["success_rate"], row["success_ci95"]), f"{row['spl']:.2f}"]
-            cells += [f"{row['return_scaled']:.1f}", f"{100 * row['collision_rate']:.0f}"]
+    lines = ["| maze | model | method | success % | SPL | return / 100 | collided % |", "|---|---|---|---|---|---|---|"]
+    for row in sorted(rows, key=lambda row: not row["seen"]):
+        maze = f"{row['maze']} ({'seen' if row['seen'] else 'unseen'})"
+        cells = [maze, f"{row['variant']}, seed {row['model_seed']}", row["method"], percent(row, "success")]
+        cells += [mean(row["spl"], row["spl_ci95"], 2)]
+        cells += [mean(row["return_scaled"], row["return_scaled_ci95"], 1), percent(row, "collision")]
         lines.append("| " + " | ".join(cells) + " |")
     made = {(row["commit"], row["hardware"], row["created"][:10]) for row in rows}
     commits, machines, days = (", ".join(sorted({m[i] for m in made})) for i in range(3))
