@@ -1,5 +1,6 @@
 """Collection: successes only, exactly as many as asked for, told as they were towards the final goal."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
-from ct_jax.collect import GUIDES, CollectConfig, collect, draw_batch, make_guide, to_trajectories
+from ct_jax.collect import GUIDES, CollectConfig, collect, draw_batch, make_guide, run_episodes, to_trajectories
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Steps
 
@@ -153,8 +154,9 @@ def test_what_came_after_the_end_counts_for_nothing():
     np.testing.assert_array_equal(data.position[1, 0], pairs[0, 1])
 
 
-def test_without_compilation(push):
+def test_without_compilation(push, monkeypatch):
     """The very first steps of a collection that is cut short: it gives up, and says so."""
+    monkeypatch.setattr("ct_jax.collect.run_episodes", functools.partial(run_episodes, chunk=1))
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=1)
     config = CollectConfig(trajectories=1, reset_interval=1, envs=1, horizon=1, give_up=1.0)
     maze = jax.tree.map(lambda leaf: leaf[:1], MAZES)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from ct_envs import POINT, MazeEnv, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
+from ct_jax.collect import run_episodes
 from ct_jax.evaluate import Episodes, Pairs, bootstrap, draw_pairs, evaluate, wilson
 from ct_jax.pipeline import result_row
 from ct_jax.policy import TransformerPolicy
@@ -194,7 +195,9 @@ def test_the_transformer_is_asked_for_its_value(policy, pairs):
     np.testing.assert_array_equal(done.timeout, ~done.success)
 
 
-def test_without_compilation(policy, push):
+def test_without_compilation(policy, monkeypatch):
+    one_step = lambda *args, chunk, **options: run_episodes(*args, chunk=1, **options)  # noqa: E731
+    monkeypatch.setattr("ct_jax.evaluate.run_episodes", one_step)
     maze = load_maze("antmaze-umaze")
     two = Pairs(np.float32([[6, 6]]), np.float32([[6.7, 6]]), np.float32([0.7]), 0)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=1)
