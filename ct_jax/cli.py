@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
@@ -21,6 +21,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subc
 from ct_envs.errors import UserError
 from ct_jax import __version__
 from ct_jax.interrupts import Terminated, interruptible
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
@@ -291,9 +294,18 @@ def _report(command: Report) -> None:
     print(write_report(command.run))
 
 
+def _console(width: int | None = None) -> "Console":
+    from rich.console import Console
+
+    class Ours(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # for ``guarded``; rich would end the program with status 1
+
+    return Ours(width=width)
+
+
 def _mazes(command: Mazes) -> None:
     from rich.columns import Columns
-    from rich.console import Console
     from rich.panel import Panel
 
     from ct_envs.maze import draw_walls, load_walls, maze_names
@@ -302,7 +314,7 @@ def _mazes(command: Mazes) -> None:
         text = draw_walls(load_walls(name)).replace("#", "██").replace(".", "  ")
         return Panel(text, title=name, expand=False)
 
-    Console().print(Columns([picture(name) for name in maze_names()]))
+    _console().print(Columns([picture(name) for name in maze_names()]))
 
 
 # ----------------------------------------------------------------------------------------------------------- table
@@ -322,7 +334,6 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
 
 def print_rows(rows: list[Row]) -> None:
     """Print results as a table."""
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, header_style="bold")
@@ -330,7 +341,7 @@ def print_rows(rows: list[Row]) -> None:
         table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(show(row) for show in _COLUMNS.values()))
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    _console(width=None if sys.stdout.isatty() else 120).print(table)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ from ct_jax.model import TrainedModel, blank_model, load_model, save_model
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
-from ct_jax.report import write_report
 from ct_jax.run import Run, join_mazes, open_run, slug
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
@@ -45,6 +44,8 @@ def train(run: Run, *, resume: bool = False) -> Path:
         UserError: bad input, or a stage that cannot succeed.
         KeyboardInterrupt: Ctrl-C; ``resume`` goes on from there.
     """
+    from ct_jax.report import write_report  # matplotlib, which takes its time and has its say about folders
+
     with open_run(run, resume=resume):
         metrics = Metrics(run.folder)
         try:
