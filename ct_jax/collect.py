@@ -49,7 +49,7 @@ def run_episodes(
     Args:
         on_progress: told (steps, episodes that are over) after every ``chunk``.
     """
-    parts = []
+    parts, chunk = [], min(chunk, limit)
     for i in range(-(-limit // chunk)):
         state, memory, steps = rollout(env, policy, state, memory, jax.random.fold_in(key, i), chunk)  # pyright: ignore
         parts.append(jax.tree.map(np.asarray, steps))

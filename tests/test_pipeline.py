@@ -18,7 +18,7 @@ from ct_jax import pipeline
 from ct_jax import run as runs
 from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
-from ct_jax.evaluate import METHODS, draw_pairs
+from ct_jax.evaluate import METHODS
 from ct_jax.model import load_model
 from ct_jax.presets import Settings
 from ct_jax.progress import Bar
@@ -313,11 +313,9 @@ def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, mon
         episodes=2,
     )
 
-    def draw(*arguments, **options):
-        with jax.disable_jit(False):  # the lengths of the ways come from a roadmap of a thousand points
-            return draw_pairs(*arguments, **options)
-
-    monkeypatch.setattr(pipeline, "draw_pairs", draw)
+    # What would take minutes op by op, and is tested elsewhere: a roadmap of a thousand points, and first parameters.
+    for name in ("draw_pairs", "init_params"):
+        monkeypatch.setattr(pipeline, name, jax.disable_jit(False)(getattr(pipeline, name)))
     run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
     assert pipeline.train(run).is_file()
     assert {row["method"] for row in pipeline.results(run.folder)} == set(METHODS)
