@@ -17,7 +17,8 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from ct_envs import UserError
+from ct_envs import Robot, UserError
+from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.trajectories import Trajectories, Window, pad, sample_windows, select
@@ -37,7 +38,7 @@ class FitConfig:
     warmup: int = 10_000  # updates of linear warm-up
     decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
     clip: float = 1.0  # norm to which gradients are clipped
-    mirror: bool = False  # rotate and reflect pieces at random
+    mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
     shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
 
 
@@ -73,8 +74,9 @@ Loss = Callable[[Any, Window, jax.Array], jax.Array]
 class Fit:
     """A learner by gradient descent on windows of trajectories: ``create`` and ``train``, both pure."""
 
-    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float):
+    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float, robot: Robot):
         self.loss, self.config, self.map_cell_m = loss, config, map_cell_m
+        self._symmetries = symmetries(robot) if config.mirror else None
         if config.decay:
             rate = optax.warmup_cosine_decay_schedule(
                 0.0, config.learning_rate, config.warmup, max(config.updates, config.warmup + 1)
@@ -109,7 +111,7 @@ class Fit:
                 batch=self.config.batch,
                 steps=self.config.steps,
                 map_cell_m=self.map_cell_m,
-                mirror=self.config.mirror,
+                symmetries=self._symmetries,
                 shift_timestep=self.config.shift_timestep,
             )
             window = jax.lax.with_sharding_constraint(window, shard)

@@ -15,7 +15,7 @@ from brax.training.acme import running_statistics, specs
 from ct_envs import MazeEnv, UserError
 from ct_envs.robots import get_robot
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
-from ct_jax.controllers.sac import SacController, controller_networks
+from ct_jax.controllers.sac import SacController, controller_networks, input_size
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
@@ -101,7 +101,7 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     maps, proprio, goal, *rest = sample_inputs(env.proprio_size, env.action_size)
     transformer = ControlTransformer(settings.model, env.action_size)
     value = ValueNetwork(settings.value.width)
-    size = env.proprio_size + 2
+    size = input_size(env.proprio_size, settings.sac.frame)
 
     def build(key: jax.Array) -> tuple[TransformerPolicy, SacController]:
         policy = TransformerPolicy(
@@ -118,6 +118,7 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
             policy=controller_networks(size, env.action_size, settings.sac.hidden).policy_network.init(key),
             action_size=env.action_size,
             hidden=settings.sac.hidden,
+            frame=settings.sac.frame,
         )
         return policy, controller
 

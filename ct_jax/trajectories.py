@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from ct_envs import UserError
+from ct_envs.frames import Symmetries
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 
@@ -119,7 +120,7 @@ def sample_windows(
     batch: int,
     steps: int,
     map_cell_m: float,
-    mirror: bool = False,
+    symmetries: Symmetries | None = None,
     shift_timestep: int = 0,
 ) -> Window:
     """Draw pieces of ``steps`` steps: a trajectory by its length, and any of its whole pieces alike.
@@ -127,8 +128,7 @@ def sample_windows(
     Args:
         rtg: ``trajectories.rtg``, computed once.
         mazes: stacked; ``trajectories.maze`` points into it.
-        mirror: also rotate and reflect each piece by a random symmetry of the square, which is exact for a robot with
-            ``planar_symmetry``.
+        symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
@@ -155,32 +155,26 @@ def sample_windows(
         valid=valid.astype(jnp.float32),
         learn=valid * take(trajectories.learn),
     )
-    return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, 8), window) if mirror else window
+    if symmetries is None:
+        return window
+    return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world)), symmetries, window)
 
 
-def mirror_windows(symmetry: Int[Array, "B"], window: Window) -> Window:
-    """Apply symmetries of the square, 0 (identity) to 7, to pieces: bit 0 swaps x and y, bit 1 flips x, bit 2 y.
-
-    Proprioception and actions must be lists of planar vectors (``Robot.planar_symmetry``).
-    """
-    swap, flip_x, flip_y = ((symmetry >> bit) & 1 == 1 for bit in (0, 1, 2))
-    sign = jnp.stack([jnp.where(flip_x, -1.0, 1.0), jnp.where(flip_y, -1.0, 1.0)], -1)
-
-    def vectors(values: jax.Array) -> jax.Array:
-        planar = values.reshape(*values.shape[:-1], -1, 2)
-        planar = jnp.where(swap[:, None, None, None], planar[..., ::-1], planar) * sign[:, None, None, :]
-        return planar.reshape(values.shape)
+def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:
+    """Apply the symmetries ``which`` of a robot to pieces of its trajectories and their maps."""
+    world, proprio, action = (jnp.asarray(matrices)[which] for matrices in symmetries)
+    apply = lambda matrices, values: jnp.einsum("bij,bsj->bsi", matrices, values)  # noqa: E731
 
     def grid(values: jax.Array) -> jax.Array:
         pick = lambda bit, a: jnp.where(bit[:, None, None, None, None], a, values)  # noqa: E731
-        values = pick(swap, jnp.swapaxes(values, -1, -2))
-        values = pick(flip_x, values[..., ::-1])
-        return pick(flip_y, values[..., ::-1, :])
+        values = pick(world[:, 0, 0] == 0, jnp.swapaxes(values, -1, -2))  # x becomes y
+        values = pick(world[:, 0].sum(-1) < 0, values[..., ::-1])
+        return pick(world[:, 1].sum(-1) < 0, values[..., ::-1, :])
 
     return window.replace(
         map=grid(window.map),
-        proprio=vectors(window.proprio),
-        goal=vectors(window.goal),
-        action=vectors(window.action),
-        target=vectors(window.target),
+        proprio=apply(proprio, window.proprio),
+        goal=apply(world, window.goal),
+        action=apply(action, window.action),
+        target=apply(action, window.target),
     )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ct_envs import UserError, load_maze, stack_mazes
+from ct_envs import POINT, UserError, load_maze, stack_mazes
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.fit import (
     Fit,
@@ -42,7 +42,7 @@ def data(toy_data):
 @pytest.fixture(scope="module")
 def learner():
     """One for all, so that it compiles once."""
-    return Fit(transformer_loss(MODEL), CONFIG, 0.8)
+    return Fit(transformer_loss(MODEL), CONFIG, 0.8, POINT)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def same(a, b) -> bool:
 def test_the_loss_falls(data, params):
     losses = []
     run(
-        Fit(transformer_loss(MODEL), replace(CONFIG, updates=120, batch=16), 0.8),
+        Fit(transformer_loss(MODEL), replace(CONFIG, updates=120, batch=16), 0.8, POINT),
         params,
         data,
         chunk=20,
@@ -81,7 +81,7 @@ def test_the_seed_decides(learner, params, data):
 
 
 def test_chunks_compile_once_and_change_nothing(data, params):
-    learner = Fit(transformer_loss(MODEL), CONFIG, 0.8)
+    learner = Fit(transformer_loss(MODEL), CONFIG, 0.8, POINT)
     by_two = run(learner, params, data, chunk=2)
     assert learner.train._cache_size() == 1
     by_four = run(learner, params, data, chunk=4)
@@ -89,7 +89,7 @@ def test_chunks_compile_once_and_change_nothing(data, params):
 
 
 def test_the_rate_warms_up_from_zero(data, params):
-    learner = Fit(transformer_loss(MODEL), replace(CONFIG, warmup=4, weight_decay=0.0), 0.8)
+    learner = Fit(transformer_loss(MODEL), replace(CONFIG, warmup=4, weight_decay=0.0), 0.8, POINT)
     state = learner.create(jax.random.key(0), params)
     sizes = []
     for _ in range(6):
@@ -104,7 +104,7 @@ def test_the_rate_warms_up_from_zero(data, params):
 
 
 def test_biases_do_not_decay():
-    learner = Fit(lambda params, window, key: jnp.zeros(()), replace(CONFIG, weight_decay=0.5, warmup=1), 0.8)
+    learner = Fit(lambda params, window, key: jnp.zeros(()), replace(CONFIG, weight_decay=0.5, warmup=1), 0.8, POINT)
     params = {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)}
     state = learner.optimizer.init(params)
     for _ in range(2):
@@ -191,13 +191,13 @@ ON_FOUR_DEVICES = """
 import sys
 from pathlib import Path
 import jax
-from ct_envs import load_maze, stack_mazes
+from ct_envs import POINT, load_maze, stack_mazes
 from ct_jax.fit import Fit, FitConfig, fit, init_params, value_loss
 from ct_jax.trajectories import load
 from ct_jax.value import ValueNetwork
 
 data, model, losses = load(Path(sys.argv[1])), ValueNetwork(8), []
-learner = Fit(value_loss(model), FitConfig(**eval(sys.argv[2])), 0.8)
+learner = Fit(value_loss(model), FitConfig(**eval(sys.argv[2])), 0.8, POINT)
 params = init_params(jax.random.key(0), model, data)
 assert len(learner.create(jax.random.key(0), params).update.sharding.device_set) == jax.device_count() == 4
 fit(
@@ -220,7 +220,7 @@ def test_four_devices_learn_the_same_as_one(data, tmp_path):
     four = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
     assert four.returncode == 0, four.stderr
     model, one = ValueNetwork(8), []
-    learner = Fit(value_loss(model), FitConfig(**config), 0.8)
+    learner = Fit(value_loss(model), FitConfig(**config), 0.8, POINT)
     params = init_params(jax.random.key(0), model, data)
     run(learner, params, data, on_progress=lambda update, loss: one.append(loss))
     assert len(one) == 3 and one[-1] < one[0]
@@ -229,7 +229,7 @@ def test_four_devices_learn_the_same_as_one(data, tmp_path):
 
 def test_without_compilation(data):
     model = ValueNetwork(4)
-    learner = Fit(value_loss(model), FitConfig(updates=2, batch=2, steps=1, warmup=1), 0.8)
+    learner = Fit(value_loss(model), FitConfig(updates=2, batch=2, steps=1, warmup=1), 0.8, POINT)
     params = init_params(jax.random.key(0), model, data)
     compiled = run(learner, params, data)
     with jax.disable_jit():

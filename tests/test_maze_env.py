@@ -195,16 +195,19 @@ def test_actions_beyond_one_are_clipped():
 
 
 def test_collision_is_told_while_a_wall_is_touched(wall_distance):
+    """The engines tell it of the last substep's beginning, so a first or last touch may go unseen."""
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(7), LARGE, None)
-    told = []
+    distances, told = [], []
     for _ in range(30):
         state = step(state.replace(info=state.info | {"episode_steps": jnp.zeros(N, jnp.int32)}), jnp.ones((N, 2)))
-        distance = wall_distance(load_walls("antmaze-large"), state.info["position"])
-        clear = np.abs(distance - POINT.radius_m) > 1e-4
+        distances.append(wall_distance(load_walls("antmaze-large"), state.info["position"]))
         told.append(np.asarray(state.info["collision"]))
-        np.testing.assert_array_equal(told[-1][clear], (distance < POINT.radius_m)[clear])
-    assert 0 < np.mean(told) < 1
+    distance, told = np.stack(distances), np.stack(told) > 0
+    touching = distance < POINT.radius_m
+    steady = (np.abs(distance - POINT.radius_m) > 1e-3)[1:] & (touching[1:] == touching[:-1])
+    assert (told == touching)[1:][steady].mean() > 0.98  # but for a touch between two steps
+    assert 0.1 < told[1:][steady].mean() < 0.9 and steady.mean() > 0.8
 
 
 # --------------------------------------------------------------------------------------- starts, goals, tasks

@@ -42,7 +42,7 @@ boxes_at = jax.jit(jax.vmap(nearest_walls, (None, 0)))
 @functools.partial(jax.jit, static_argnums=0)
 def step(engine, maze, state, ctrl):
     walls = jax.vmap(nearest_walls, (None, 0))(maze, state.qpos[:, :2])
-    return jax.vmap(engine.step)(state, ctrl, walls)
+    return jax.vmap(engine.step)(state, ctrl, walls)[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -51,7 +51,7 @@ def drive(engine, maze, state, ctrls):
 
     def once(state, ctrl):
         walls = jax.vmap(nearest_walls, (None, 0))(maze, state.qpos[:, :2])
-        state = jax.vmap(engine.step)(state, ctrl, walls)
+        state, _ = jax.vmap(engine.step)(state, ctrl, walls)
         return state, state
 
     return jax.lax.scan(once, state, ctrls)[1]
@@ -118,11 +118,11 @@ def test_nested_vmap_is_one_flat_batch(engine, wall_distance):
     inputs = (state, ctrl, boxes_at(maze, state.qpos))
     grid = jax.tree.map(lambda leaf: leaf.reshape(4, N // 4, *leaf.shape[1:]), inputs)
     flat = step(engine("mujoco"), maze, state, ctrl)
-    nested = jax.jit(jax.vmap(jax.vmap(engine("mujoco").step)))(*grid)
+    nested = jax.jit(jax.vmap(jax.vmap(engine("mujoco").step)))(*grid)[0]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b.reshape(a.shape), atol=1e-6), flat, nested)
-    one = jax.jit(engine("mujoco").step)(*jax.tree.map(lambda leaf: leaf[0], inputs))  # a batch of one
+    one = jax.jit(engine("mujoco").step)(*jax.tree.map(lambda leaf: leaf[0], inputs))[0]  # a batch of one
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[0], b, atol=1e-6), flat, one)
-    shapes = jax.eval_shape(jax.vmap(jax.vmap(engine("mjx").step)), *grid)
+    shapes = jax.eval_shape(jax.vmap(jax.vmap(engine("mjx").step)), *grid)[0]
     jax.tree.map(lambda a, b: np.testing.assert_equal(a.shape, b.shape), shapes, nested)
 
 

@@ -7,14 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ct_envs import UserError, load_maze, make_maze, random_walls, stack_mazes
+from ct_envs import POINT, UserError, load_maze, make_maze, random_walls, stack_mazes
+from ct_envs.frames import symmetries
 from ct_envs.occupancy import local_map
 from ct_jax.trajectories import Trajectories, concatenate, load, mirror_windows, sample_windows, save, select
 
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
 LENGTHS = [3, 17, 40]
 CELL = 0.8
-draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "mirror", "shift_timestep"))
+draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep"))
+GROUP = symmetries(POINT)
 
 
 def fields(data):
@@ -128,7 +130,7 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
 
 def test_the_eight_symmetries_are_a_group(toy_data):
     one = jax.tree.map(lambda leaf: leaf[:1], windows(toy_data([30], seed=3)))
-    images = [mirror_windows(jnp.array([s]), one) for s in range(8)]
+    images = [mirror_windows(jnp.array([s]), GROUP, one) for s in range(8)]
     names = ("map", "proprio", "goal", "action", "target")
 
     def index(window) -> int:
@@ -138,11 +140,17 @@ def test_the_eight_symmetries_are_a_group(toy_data):
         return equal.index(True)
 
     assert [index(image) for image in images] == list(range(8))  # all differ
-    table = np.array([[index(mirror_windows(jnp.array([s]), image)) for image in images] for s in range(8)])
+    table = np.array([[index(mirror_windows(jnp.array([s]), GROUP, image)) for image in images] for s in range(8)])
     for line in (*table, *table.T):
         assert sorted(line) == list(range(8))  # closed, and each can be undone
     assert (table[0] == np.arange(8)).all()
     assert (table != table.T).any()  # rotations and reflections do not commute
+
+
+def element(bits: int) -> int:
+    """Number in the group of: swap x and y (bit 0), then flip x (bit 1), then flip y (bit 2)."""
+    world = np.diag([1.0 - (bits & 2), 1.0 - (bits >> 1 & 2)]) @ (np.eye(2)[::-1] if bits & 1 else np.eye(2))
+    return int(np.flatnonzero((GROUP.world == world).all((1, 2)))[0])
 
 
 def turn_world(symmetry: int, mazes, data: Trajectories):
@@ -175,17 +183,17 @@ def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry)
     window = draw(jax.random.key(0), data, data.rtg, mazes, **options)
     other = draw(jax.random.key(0), turned, turned.rtg, turned_mazes, **options)
     assert window.map[:, :, 1].any() and window.map[:, :, 0].any()
-    same(mirror_windows(jnp.full(16, symmetry), window), other)
+    same(mirror_windows(jnp.full(16, element(symmetry)), GROUP, window), other)
 
 
 def test_mirroring_draws_all_symmetries(toy_data):
     data = toy_data([30])
-    plain, mirrored = windows(data), windows(data, mirror=True)
+    plain, mirrored = windows(data), windows(data, symmetries=GROUP)
     found = {
         s
         for s in range(8)
         for i in range(64)
-        if np.array_equal(mirror_windows(jnp.full(64, s), plain).action[i], mirrored.action[i])
+        if np.array_equal(mirror_windows(jnp.full(64, s), GROUP, plain).action[i], mirrored.action[i])
     }
     assert found == set(range(8))
 

@@ -24,6 +24,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
+from ct_envs.frames import own_frame, symmetries, turn
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.prm import Roadmap
@@ -44,11 +45,16 @@ class SacConfig:
     discount: float = 0.97
     initial_temperature: float = 0.1
     arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
+    fall_m: float = 5.0  # a fall costs what lying for ever this much farther from the goal would [m]
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
     replay: int = 200_000  # transitions kept
     episode_steps: int = 60  # control steps to walk an edge
     reset_velocity_mps: float = 2.0  # spread of the speed at an edge's start: a plan arrives there moving
     held_out: float = 0.1  # share of the edges kept for the final test
+    frame: str = "world"  # of what the networks see: the "world"'s, or the robot's own "heading"
+    mirror: bool = False  # replay each transition as one of the robot's symmetries would have it
+    chain: bool = False  # after a success go on from there along a next edge, as a plan does
+    reward_scale: float = 1.0  # of the reward in the losses
 
 
 @struct.dataclass
@@ -73,6 +79,23 @@ def _observe(state: State) -> jax.Array:
     return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
 
 
+FRAMES = ("world", "heading")
+
+
+def controller_inputs(observation: Float[Array, "*b P+2"], frame: str) -> Float[Array, "*b I"]:
+    """What the networks see of proprioception and the vector to the goal [m], in the given frame."""
+    if frame == "world":
+        return observation
+    proprio, goal = observation[..., :-2], observation[..., -2:]
+    heading, own = own_frame(proprio)
+    return jnp.concatenate([own, turn(heading, goal)], -1)
+
+
+def input_size(proprio_size: int, frame: str) -> int:
+    """Length of ``controller_inputs``."""
+    return jax.eval_shape(lambda o: controller_inputs(o, frame), jax.ShapeDtypeStruct((proprio_size + 2,), "float32")).shape[0]  # fmt: skip
+
+
 def controller_networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
     """Policy and critics for a controller of these sizes."""
     return sac_networks.make_sac_networks(
@@ -91,10 +114,12 @@ class SacController:
     policy: Any
     action_size: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
+    frame: str = struct.field(pytree_node=False, default="world")
 
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
-        networks = controller_networks(proprio.shape[-1] + 2, self.action_size, self.hidden)
-        logits = networks.policy_network.apply(self.normalizer, self.policy, jnp.concatenate([proprio, goal], -1))
+        inputs = controller_inputs(jnp.concatenate([proprio, goal], -1), self.frame)
+        networks = controller_networks(inputs.shape[-1], self.action_size, self.hidden)
+        logits = networks.policy_network.apply(self.normalizer, self.policy, inputs)
         return networks.parametric_action_distribution.mode(logits)
 
 
@@ -117,6 +142,18 @@ def _tasks(roadmap: Roadmap, edges: np.ndarray) -> Tasks:
     return Tasks(start, goal, jnp.asarray(len(edges), jnp.int32))
 
 
+def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
+    """The tasks, each followed by one of some that begin where it ends (the way back is always there)."""
+    rng = np.random.default_rng(seed)
+    start, goal = np.asarray(tasks.start), np.asarray(tasks.goal)
+    _, place = np.unique(np.concatenate([start, goal]), axis=0, return_inverse=True)
+    begins, ends = place.ravel()[: len(start)], place.ravel()[len(start) :]
+    order = np.argsort(begins, kind="stable")
+    first, last = (np.searchsorted(begins[order], ends, side) for side in ("left", "right"))
+    follow = order[rng.integers(first[:, None], last[:, None], (len(ends), choices))]
+    return tasks.replace(follow=jnp.asarray(follow, jnp.int32))
+
+
 class Sac:
     """The learner: ``create`` and ``train`` on states, both pure."""
 
@@ -125,11 +162,17 @@ class Sac:
         Args:
             env: with auto-reset and without maps; its robot says which reward is used.
         """
+        if config.frame not in FRAMES:
+            raise UserError(f"no frame named '{config.frame}'; frames: {', '.join(FRAMES)}")
+        if config.frame == "heading" and not env.robot.has_heading:
+            raise UserError(f"robot '{env.robot.name}' has no heading; use frame='world'")
         self.env, self.config = env, config
-        self.networks = controller_networks(env.proprio_size + 2, env.action_size, config.hidden)
+        self._symmetries = symmetries(env.robot) if config.mirror else None
+        self._input_size = input_size(env.proprio_size, config.frame)
+        self.networks = controller_networks(self._input_size, env.action_size, config.hidden)
         self._optimizer = optax.adam(config.learning_rate)
         alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
-            self.networks, reward_scaling=1.0, discounting=config.discount, action_size=env.action_size
+            self.networks, reward_scaling=config.reward_scale, discounting=config.discount, action_size=env.action_size
         )
         update = functools.partial(gradients.gradient_update_fn, pmap_axis_name=None)
         self._alpha_update = update(alpha_loss, self._optimizer)
@@ -162,7 +205,7 @@ class Sac:
             policy_optimizer=self._optimizer.init(policy),
             critic_optimizer=self._optimizer.init(critic),
             alpha_optimizer=self._optimizer.init(log_alpha),
-            normalizer=running_statistics.init_state(specs.Array((self.env.proprio_size + 2,), jnp.dtype("float32"))),
+            normalizer=running_statistics.init_state(specs.Array((self._input_size,), jnp.dtype("float32"))),
             replay=self._buffer.init(buffer_key),
             env=resets(jax.random.split(env_key, self.config.envs), maze, tasks),
             key=key,
@@ -185,12 +228,14 @@ class Sac:
         state, metrics = jax.lax.scan(iterate, state, length=iterations)
         ends = jnp.maximum(metrics["episodes"].sum(), 1.0)
         means = jax.tree.map(jnp.mean, metrics)
-        return state, means | {"success": metrics["successes"].sum() / ends}
+        rates = {"success": metrics["successes"].sum() / ends, "fall": metrics["falls"].sum() / ends}
+        return state, means | rates
 
     def _collect(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         key, act_key, random_key = jax.random.split(state.key, 3)
         observation = _observe(state.env)
-        logits = self.networks.policy_network.apply(state.normalizer, state.policy, observation)
+        inputs = controller_inputs(observation, self.config.frame)
+        logits = self.networks.policy_network.apply(state.normalizer, state.policy, inputs)
         action = self.networks.parametric_action_distribution.sample(logits, act_key)
         random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
@@ -209,29 +254,49 @@ class Sac:
         state = state.replace(
             key=key,
             env=after,
-            normalizer=running_statistics.update(state.normalizer, observation),
+            normalizer=running_statistics.update(state.normalizer, inputs),
             replay=self._buffer.insert_internal(state.replay, transition),
         )
-        successes = (over * after.info["success"]).sum()
-        return state, {"reward": reward.mean(), "episodes": over.sum(), "successes": successes}
+        count = lambda name: (over * after.info[name]).sum()  # noqa: E731
+        return state, {
+            "reward": reward.mean(), "episodes": over.sum(), "successes": count("success"), "falls": count("fall"),
+        }  # fmt: skip
 
     def _reward(self, before: State, after: State) -> jax.Array:
-        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus."""
+        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus.
+
+        A fall is paid like lying for ever, ``fall_m`` farther off: else it would end the losses of a robot far away.
+        """
         robot = self.env.robot
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
         dense = {
             "velocity": (distance + after.reward) / robot.control_dt_s,
             "distance": after.reward,
         }[robot.controller_reward]
-        return dense + self.config.arrival_bonus * after.done * after.info["success"]
+        fallen = after.done * after.info["fall"]
+        for_ever = (after.reward - self.config.fall_m) / (1.0 - self.config.discount)
+        return jnp.where(fallen > 0, for_ever, dense) + self.config.arrival_bonus * after.done * after.info["success"]
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         state, losses = jax.lax.scan(lambda s, _: self._update(s), state, length=self.config.updates)
         return state, jax.tree.map(jnp.mean, losses)
 
+    def _present(self, batch: Transition, key: jax.Array) -> Transition:
+        """A batch from the replay as the networks see it."""
+        now, action, after = batch.observation, batch.action, batch.next_observation
+        if self._symmetries is not None:
+            pick = jax.random.randint(key, (len(action),), 0, len(self._symmetries.world))
+            world, proprio, joints = (jnp.asarray(matrices)[pick] for matrices in self._symmetries)
+            apply = lambda matrices, rows: jnp.einsum("bij,bj->bi", matrices, rows)  # noqa: E731
+            whole = lambda o: jnp.concatenate([apply(proprio, o[:, :-2]), apply(world, o[:, -2:])], -1)  # noqa: E731
+            now, action, after = whole(now), apply(joints, action), whole(after)
+        see = functools.partial(controller_inputs, frame=self.config.frame)
+        return batch._replace(observation=see(now), action=action, next_observation=see(after))
+
     def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
-        key, alpha_key, critic_key, actor_key = jax.random.split(state.key, 4)
+        key, alpha_key, critic_key, actor_key, mirror_key = jax.random.split(state.key, 5)
         replay, batch = self._buffer.sample_internal(state.replay)
+        batch = self._present(batch, mirror_key)
         alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
             state.log_alpha, state.policy, state.normalizer, batch, alpha_key, optimizer_state=state.alpha_optimizer
         )
@@ -298,6 +363,8 @@ def train_controller(
     train_key, test_key, split_key = jax.random.split(key, 3)
     seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
     train_tasks, test_tasks = split_edges(roadmap, config.held_out, seed)
+    if config.chain:
+        train_tasks = chain_tasks(train_tasks, seed)
     env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
     sac = Sac(env, config)
     state = sac.create(train_key, maze, train_tasks)
@@ -306,6 +373,6 @@ def train_controller(
         lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
         checkpoints, chunk,
     )  # fmt: skip
-    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden)
+    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden, config.frame)
     test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
     return act, edge_success(test_env, act, maze, test_tasks, test_key)

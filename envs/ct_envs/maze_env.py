@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from ct_envs.errors import UserError
-from ct_envs.maze import CELL_M, Maze, clearance, sample_pair
+from ct_envs.maze import CELL_M, Maze, sample_pair
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_envs.physics import PhysicsState, make_engine, nearest_walls
 from ct_envs.robots import Robot, get_robot
@@ -25,16 +25,18 @@ class Tasks:
     start: Float[Array, "*b M 2"]  # [m]
     goal: Float[Array, "*b M 2"]  # [m]
     n: Int[Array, "*b"]  # how many of the M are meant
+    follow: Int[Array, "*b M D"] | None = None  # tasks one of which follows a success, from where the robot is then
 
 
 class MazeEnv(Env):
     """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-F).
 
-    Observation: a dict of ``proprio`` [P] (for the point: its velocity, m/s), ``goal`` [2] (from the robot to the
-    goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action: [-1, 1]^nu. An episode ends with success (within the
-    goal tolerance), with a failure (a state or action that is not finite) or, as truncation, at the horizon.
-    ``state.info`` holds ``success``, ``collision`` (touching a wall now), ``truncation``, ``episode_steps``,
-    ``position``, ``goal``, ``maze``, ``tasks`` and ``key``.
+    Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
+    velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action:
+    [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or action
+    that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``, ``collision``
+    (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``, ``tasks`` and
+    ``key``.
     """
 
     def __init__(
@@ -101,29 +103,56 @@ class MazeEnv(Env):
         key, now = jax.random.split(rng)
         zero = jnp.zeros(())
         info = {"key": key, "maze": maze, "tasks": tasks}
-        info |= {"truncation": zero, "success": zero, "collision": zero}
+        info |= {"truncation": zero, "success": zero, "fall": zero, "collision": zero}
         return self._begin(now, State(None, {}, zero, zero, {}, info))
 
     def _begin(self, key: jax.Array, state: State) -> State:
         """The first state of an episode, in the maze and with the tasks of ``state``."""
-        start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
+        task, start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
         physics = self._initial_physics(jax.random.fold_in(key, 1), start)
-        info = state.info | {"goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
+        info = state.info | {"task": task, "goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
         return self._observe(physics, state.replace(info=info))
 
-    def _draw_task(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> tuple[jax.Array, jax.Array]:
+    def _draw_task(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Number, start and goal of a task."""
         if tasks is not None:
             i = jax.random.randint(key, (), 0, tasks.n)
-            return tasks.start[i], tasks.goal[i]
-        return sample_pair(key, maze, radius=self.robot.radius_m)
+            return i, tasks.start[i], tasks.goal[i]
+        return jnp.zeros((), jnp.int32), *sample_pair(key, maze, radius=self.robot.radius_m)
+
+    def _go_on(self, key: jax.Array, finished: State, fresh: State) -> tuple[PhysicsState, State]:
+        """After a success, where tasks follow each other: the robot as it is, with the next goal."""
+        tasks, physics = finished.info["tasks"], fresh.pipeline_state
+        if tasks is None or tasks.follow is None:
+            return physics, fresh
+        won = finished.info["success"] > 0
+        choice = jax.random.randint(key, (), 0, tasks.follow.shape[-1])
+        task = jnp.where(won, tasks.follow[finished.info["task"], choice], fresh.info["task"])
+        physics = jax.tree.map(lambda old, new: jnp.where(won, old, new), finished.pipeline_state, physics)
+        goal = jnp.where(won, tasks.goal[task], fresh.info["goal"])
+        return physics, fresh.replace(info=fresh.info | {"task": task, "goal": goal})
 
     def _initial_physics(self, key: jax.Array, start: jax.Array) -> PhysicsState:
-        model = self.engine.model
-        qpos = jnp.asarray(model.qpos0, jnp.float32).at[:2].set(start)
+        """Standing at ``start`` [m]; a robot that has a heading looks anywhere."""
+        model, robot = self.engine.model, self.robot
+        speed_key, yaw_key, joint_key = jax.random.split(key, 3)
+        qpos = jnp.asarray(model.key_qpos[0] if model.nkey else model.qpos0, jnp.float32).at[:2].set(start)
+        if robot.has_heading:
+            half = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi) / 2.0
+            qpos = qpos.at[3:7].set(jnp.array([jnp.cos(half), 0.0, 0.0, jnp.sin(half)]))
+            noise = jax.random.uniform(joint_key, qpos[7:].shape, minval=-1.0, maxval=1.0)
+            qpos = qpos.at[7:].add(robot.reset_joints_rad * noise)
         qvel = jnp.zeros(model.nv)
         if self._reset_velocity:
-            qvel = self._reset_velocity * jax.random.normal(key, (model.nv,))
+            qvel = self._reset_velocity * jax.random.normal(speed_key, (model.nv,))
         return PhysicsState(qpos, qvel, jnp.zeros(model.nv))
+
+    def _fell(self, physics: PhysicsState) -> jax.Array:
+        """Whether the torso is tilted too far."""
+        if self.robot.upright_min is None:
+            return jnp.zeros((), bool)
+        _, x, y, _ = physics.qpos[3:7]
+        return 1.0 - 2.0 * (x**2 + y**2) < self.robot.upright_min
 
     def _observe(self, physics: PhysicsState, state: State) -> State:
         position, goal = physics.qpos[:2], state.info["goal"]
@@ -138,7 +167,7 @@ class MazeEnv(Env):
         before = state.pipeline_state
         walls = nearest_walls(state.info["maze"], before.qpos[:2])
         ctrl = jnp.clip(action, -1.0, 1.0)
-        physics = self.engine.step(before, ctrl, walls)
+        physics, touching = self.engine.step(before, ctrl, walls)
         # The action too: MuJoCo would read one that is not a number as zero, and carry on.
         finite = jnp.all(jnp.isfinite(jnp.concatenate([physics.qpos, physics.qvel, ctrl])))
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
@@ -147,23 +176,26 @@ class MazeEnv(Env):
         position = physics.qpos[:2]
         distance = jnp.linalg.norm(info["goal"] - position)
         steps = info["episode_steps"] + 1
-        success = finite & (distance < self.robot.goal_tolerance_m)
-        collision = clearance(info["maze"], position) < self.robot.radius_m
+        fall = finite & self._fell(physics)
+        success = finite & ~fall & (distance < self.robot.goal_tolerance_m)
         over = steps >= self.horizon
-        done = success | ~finite | over
+        done = success | fall | ~finite | over
         info |= {
             "episode_steps": steps,
             "success": success.astype(jnp.float32),
-            "collision": collision.astype(jnp.float32),
-            "truncation": (over & ~success & finite).astype(jnp.float32),
+            "fall": fall.astype(jnp.float32),
+            "collision": jnp.where(finite, touching, 0.0),
+            "truncation": (over & ~success & ~fall & finite).astype(jnp.float32),
         }
         stepped = state.replace(reward=-distance, done=done.astype(jnp.float32), info=info)
         if not self.auto_reset:
             stepped = self._observe(physics, stepped)
             return jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), stepped, state)
         key, now = jax.random.split(info["key"])
-        stepped = stepped.replace(info=info | {"key": key})
+        stepped = stepped.replace(info=info | {"key": key}, pipeline_state=physics)
         fresh = self._begin(now, stepped)  # only what differs is chosen below; the observation is made once
-        goal, steps = (jnp.where(done, fresh.info[name], stepped.info[name]) for name in ("goal", "episode_steps"))
-        physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh.pipeline_state, physics)
-        return self._observe(physics, stepped.replace(info=stepped.info | {"goal": goal, "episode_steps": steps}))
+        after, fresh = self._go_on(jax.random.fold_in(now, 2), stepped, fresh)
+        names = ("task", "goal", "episode_steps")
+        chosen = {name: jnp.where(done, fresh.info[name], stepped.info[name]) for name in names}
+        physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), after, physics)
+        return self._observe(physics, stepped.replace(info=stepped.info | chosen))

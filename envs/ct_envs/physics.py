@@ -47,8 +47,11 @@ class Engine(Protocol):
     n_substeps: int
     cell_m: float
 
-    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
-        """One control step under ``ctrl`` [nu] with wall boxes centred at ``walls`` [WALLS, 3] (m)."""
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
+        """One control step under ``ctrl`` [nu] with wall boxes centred at ``walls`` [WALLS, 3] (m).
+
+        Also returns whether any part of the robot touched a wall (0 or 1) in the last substep.
+        """
         ...
 
 
@@ -67,13 +70,17 @@ def build_model(robot: Robot, *, cell_m: float = CELL_M) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_string(model_xml(robot))
     for i in range(WALLS):
         body = spec.worldbody.add_body(name=f"wall{i}", mocap=True, pos=[0, 0, _PARKED_M])
-        add_wall(body, cell_m)
+        add_wall(body, cell_m, name=f"wall{i}")
+        sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, f"wall{i}"
+        sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1]
     return spec.compile()
 
 
-def add_wall(body: mujoco.MjsBody, cell_m: float) -> None:
+def add_wall(body: mujoco.MjsBody, cell_m: float, *, name: str = "") -> None:
     """Give a body the shape of a wall cell."""
     body.add_geom(
+        name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[cell_m / 2, cell_m / 2, WALL_HEIGHT_M / 2],
         contype=0,
@@ -121,7 +128,7 @@ class MjxEngine:
         self.model, self.n_substeps, self.cell_m = model, n_substeps, cell_m
         self._mjx_model = mjx.put_model(model)
 
-    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
         data = mjx.make_data(self._mjx_model).replace(
             qpos=state.qpos,
             qvel=state.qvel,
@@ -130,7 +137,8 @@ class MjxEngine:
             ctrl=ctrl,
         )
         data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps)
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        touching = jnp.any(data.sensordata > 0).astype(jnp.float32)
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), touching
 
 
 class MujocoEngine:
@@ -140,33 +148,34 @@ class MujocoEngine:
 
     def __init__(self, model: mujoco.MjModel, n_substeps: int, cell_m: float):
         self.model, self.n_substeps, self.cell_m = model, n_substeps, cell_m
-        self._batches: dict[int, tuple[Batch, list[np.ndarray]]] = {}
+        self._batches: dict[int, tuple[Batch, list[np.ndarray], np.ndarray]] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
 
-    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> PhysicsState:
+    def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
         # One array each way: every further one costs a call as much as the physics of ten robots.
         inputs = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl, walls.ravel()])
         nq, nv = self.model.nq, self.model.nv
-        shape = jax.ShapeDtypeStruct((nq + 2 * nv,), inputs.dtype)
+        shape = jax.ShapeDtypeStruct((nq + 2 * nv + WALLS,), inputs.dtype)
         after = jax.pure_callback(self._step, shape, inputs, vmap_method="broadcast_all")
-        return PhysicsState(after[:nq], after[nq : nq + nv], after[nq + nv :])
+        qpos, qvel, warmstart, found = jnp.split(after, [nq, nq + nv, nq + 2 * nv])
+        return PhysicsState(qpos, qvel, warmstart), jnp.any(found > 0).astype(jnp.float32)
 
     def _step(self, inputs: np.ndarray) -> np.ndarray:
         """Whole states in, whole states out; NumPy only, since JAX must not be called from a callback."""
         inputs = np.asarray(inputs)
         rows = inputs.reshape(-1, inputs.shape[-1])
         with self._lock:
-            batch, views = self._batch(len(rows))
+            batch, views, found = self._batch(len(rows))
             begin = 0
             for view in views:  # in the order of ``inputs``
                 view[:] = rows[:, begin : begin + view.shape[1]]
                 begin += view.shape[1]
             batch.step(nstep=self.n_substeps)
-            after = np.concatenate(views[:3], 1, dtype=inputs.dtype, casting="same_kind")
+            after = np.concatenate([*views[:3], found], 1, dtype=inputs.dtype, casting="same_kind")
         return after.reshape(*inputs.shape[:-1], -1)
 
-    def _batch(self, n: int) -> tuple[Batch, list[np.ndarray]]:
-        """n simulations, and their state as live arrays [n, ...] of two axes."""
+    def _batch(self, n: int) -> tuple[Batch, list[np.ndarray], np.ndarray]:
+        """n simulations, and as live arrays [n, ...] of two axes what goes in and the contacts found at the walls."""
         if n not in self._batches:
             threads = min(n, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
             batch = Batch(self.model, nsim=n, nthread=threads)
@@ -175,7 +184,7 @@ class MujocoEngine:
             views[-1] = np.lib.stride_tricks.as_strided(
                 views[-1], (n, 3 * WALLS), (views[-1].strides[0], views[-1].itemsize)
             )
-            self._batches[n] = batch, views
+            self._batches[n] = batch, views, batch.bind("sensordata")
         return self._batches[n]
 
 

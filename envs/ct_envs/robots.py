@@ -19,8 +19,10 @@ class Robot:
     horizon: int  # control steps of an episode
     goal_tolerance_m: float = 0.5
     reset_velocity_mps: float = 0.0  # standard deviation of the speed after a reset
+    reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
+    upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
     controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-F)
-    planar_symmetry: bool = False  # proprioception and action are lists of planar vectors: mirrored worlds are exact
+    has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
 
 
 POINT = Robot(
@@ -31,10 +33,24 @@ POINT = Robot(
     top_speed_mps=6.0,  # both motors at once give 4 * sqrt(2)
     control_dt_s=0.1,
     horizon=1000,
-    planar_symmetry=True,
 )
 
-ROBOTS = {robot.name: robot for robot in (POINT,)}
+ANT = Robot(
+    name="ant",
+    xml="ant.xml",
+    radius_m=1.0,  # the feet of the standing ant are 0.95 m from its centre
+    touch_m=1.25,
+    top_speed_mps=7.0,
+    control_dt_s=0.1,
+    horizon=1000,
+    reset_velocity_mps=0.1,
+    reset_joints_rad=0.1,
+    upright_min=0.0,
+    has_heading=True,
+    controller_reward="distance",
+)
+
+ROBOTS = {robot.name: robot for robot in (POINT, ANT)}
 
 
 def get_robot(name: str) -> Robot:

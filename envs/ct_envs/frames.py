@@ -1,0 +1,113 @@
+"""A robot's own frame, and the symmetries of its body.
+
+A world may be rotated and reflected by the symmetries of the square without its maps changing but for the order of
+their cells. What becomes of a robot's proprioception and action is a signed permutation; a body that looks the same
+from several sides has further ones, that leave the world as it is.
+"""
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ct_envs.errors import UserError
+from ct_envs.robots import Robot
+
+
+class Symmetries(NamedTuple):
+    """A group of G symmetries; the first is the identity."""
+
+    world: np.ndarray  # [G, 2, 2], acts on planar vectors
+    proprio: np.ndarray  # [G, P, P]
+    action: np.ndarray  # [G, A, A]
+
+
+_FLIP_X = np.array([[-1.0, 0.0], [0.0, 1.0]])
+_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+
+
+@functools.cache
+def symmetries(robot: Robot) -> Symmetries:
+    """The robot's symmetries in the square's. Raises UserError if none are known."""
+    if robot.name not in _GENERATORS:
+        raise UserError(f"robot '{robot.name}' has no known symmetries; train it with mirror=False")
+    generators = _GENERATORS[robot.name]()
+    found = [tuple(np.eye(len(matrix)) for matrix in generators[0])]
+    for element in found:  # grows while it is read
+        for generator in generators:
+            new = tuple(g @ e for g, e in zip(generator, element, strict=True))
+            # Proprioception is left out of the comparison: a quaternion and its negative are one attitude.
+            if not any(np.allclose(new[0], old[0]) and np.allclose(new[2], old[2]) for old in found):
+                found.append(new)
+    return Symmetries(*(np.stack(matrices).astype(np.float32) for matrices in zip(*found, strict=True)))
+
+
+def _point() -> list[tuple[np.ndarray, ...]]:
+    return [(matrix, matrix, matrix) for matrix in (_FLIP_X, _SWAP)]
+
+
+def _ant() -> list[tuple[np.ndarray, ...]]:
+    """Two reflections of world and body together, and a quarter turn of the body in an unchanged world."""
+    # new leg i is old leg source[i], its hip and ankle with these signs; see assets/ant.xml for the joints' axes
+    flip_x = _ant_element(_FLIP_X, -1, [1, 0, 3, 2], -1, [-1, -1, -1, -1], quat=np.diag([1.0, 1.0, -1.0, -1.0]))
+    swap = _ant_element(_SWAP, -1, [0, 3, 2, 1], -1, [1, -1, 1, -1], quat=_signed([0, 2, 1, 3], [1, -1, -1, -1]))
+    half = np.sqrt(0.5)  # right-multiplication by a quarter turn about z
+    turn = half * np.array([[1.0, 0, 0, -1], [0, 1, 1, 0], [0, -1, 1, 0], [1, 0, 0, 1]])
+    quarter = _ant_element(np.eye(2), 1, [1, 2, 3, 0], 1, [-1, 1, -1, 1], quat=turn, spin=_SWAP @ _FLIP_X)
+    return [flip_x, swap, quarter]
+
+
+def _ant_element(
+    world: np.ndarray, parity: int, source: list[int], hip: int, ankle: list[int], *, quat: np.ndarray,
+    spin: np.ndarray | None = None,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    order = list(itertools.chain.from_iterable((2 * leg, 2 * leg + 1) for leg in source))
+    signs = list(itertools.chain.from_iterable((hip, sign) for sign in ankle))
+    joints = _signed(order, signs)
+    # Velocity is a vector of the world, angular velocity an axial vector of the body.
+    velocity = _blocks(world, np.eye(1))
+    angular = _blocks(parity * world if spin is None else spin, parity * np.eye(1))
+    return world, _blocks(np.eye(1), quat, joints, velocity, angular, joints), joints
+
+
+def _signed(order: list[int], signs: list[int]) -> np.ndarray:
+    return np.diag(np.asarray(signs, float)) @ np.eye(len(order))[order]
+
+
+def _blocks(*blocks: np.ndarray) -> np.ndarray:
+    size = sum(len(block) for block in blocks)
+    whole, at = np.zeros((size, size)), 0
+    for block in blocks:
+        whole[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return whole
+
+
+_GENERATORS = {"point": _point, "ant": _ant}
+
+
+def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:
+    """The heading (a unit vector of the plane) of a robot with a free torso, and what it feels relative to it.
+
+    The second is height, the world's up in the torso's frame, joints, velocity with x along the heading, angular
+    velocity and joint velocities. It does not change when the world is turned.
+    """
+    joints = (proprio.shape[-1] - 11) // 2
+    height, quat, angles, velocity, rest = jnp.split(proprio, np.cumsum([1, 4, joints, 3]).tolist(), -1)
+    w, x, y, z = jnp.moveaxis(quat, -1, 0)
+    up = jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)], -1)
+    heading = jnp.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z)], -1)
+    heading = heading / jnp.sqrt(jnp.sum(heading**2, -1, keepdims=True) + 1e-6)
+    velocity = jnp.concatenate([turn(heading, velocity[..., :2]), velocity[..., 2:]], -1)
+    return heading, jnp.concatenate([height, up, angles, velocity, rest], -1)
+
+
+def turn(heading: Float[Array, "*b 2"], vector: Float[Array, "*b 2"]) -> jax.Array:
+    """A vector of the world as one along and across the heading."""
+    cosine, sine = heading[..., 0], heading[..., 1]
+    along = cosine * vector[..., 0] + sine * vector[..., 1]
+    return jnp.stack([along, cosine * vector[..., 1] - sine * vector[..., 0]], -1)
