@@ -15,7 +15,7 @@ CENTRE = 18.0  # [m], of the maze
 
 
 def drive(robot: Robot, proprio: jax.Array, ctrls: jax.Array) -> jax.Array:
-    """Positions about the centre and proprioception [T, G, 2 + P] under ctrls [T, G, A], each robot in its own world."""
+    """Positions about the centre and proprioception [T, G, 2 + P] under ctrls [T, G, A], each in its own world."""
     env = MazeEnv(robot, engine="mujoco", maps=False)
     nq = env.engine.model.nq
     qpos = jnp.concatenate([jnp.full((len(proprio), 2), CENTRE), proprio[:, : nq - 2]], 1)

@@ -93,7 +93,8 @@ def controller_inputs(observation: Float[Array, "*b P+2"], frame: str) -> Float[
 
 def input_size(proprio_size: int, frame: str) -> int:
     """Length of ``controller_inputs``."""
-    return jax.eval_shape(lambda o: controller_inputs(o, frame), jax.ShapeDtypeStruct((proprio_size + 2,), "float32")).shape[0]  # fmt: skip
+    whole = jax.ShapeDtypeStruct((proprio_size + 2,), jnp.float32)
+    return jax.eval_shape(functools.partial(controller_inputs, frame=frame), whole).shape[0]
 
 
 def controller_networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
