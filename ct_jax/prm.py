@@ -1,11 +1,13 @@
 """Probabilistic roadmaps: the planner that knows the maze (paper, sec. III-A).
 
 A ``Roadmap`` is a ``networkx`` graph with its points as an array and, for use under jit, an all-pairs table of next
-hops, so that "where do I go next" is a lookup with thousands of environments on different mazes at once.
+hops, so that "where do I go next" is a lookup with thousands of environments on different mazes at once. It is built
+over a ``Maze``, or any other ``Space``.
 """
 
 import functools
 from dataclasses import dataclass
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +65,22 @@ class NoPath:
         return f"no path from {start} to {goal}: {self.reason}"
 
 
+class Space(Protocol):
+    """What a roadmap asks of a world, in NumPy: ``ct_envs.turtlebot3_world.World``, or a maze as ``MazeSpace``."""
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Distance [k] (m) from points [k, 2] (m) to the nearest obstacle."""
+        ...
+
+    def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Whether discs of ``radius`` [k] (m) swept from ``a`` to ``b`` [k, 2] (m) touch nothing."""
+        ...
+
+    def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
+        """n points [n, 2] (m), uniform over the area with clearance ``radius`` [m]."""
+        ...
+
+
 @dataclass(frozen=True)
 class Roadmap:
     """A graph over collision-free points. Nodes are 0 ... n-1; edges carry their length as ``weight`` [m]."""
@@ -70,7 +88,7 @@ class Roadmap:
     graph: nx.Graph
     points: np.ndarray  # float32 [n, 2], [m]
     edges: np.ndarray  # int32 [m, 2], each once, first < second
-    maze: Maze
+    maze: Maze | Space
     radius_m: float  # of the robot; every edge keeps it clear, and edges between samples the margin too
     config: PrmConfig
 
@@ -91,7 +109,7 @@ class Roadmap:
         """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
         ends = np.asarray([start, goal], np.float32)
         for name, point in zip(("start", "goal"), ends, strict=True):
-            if not float(_clearances(self.maze, jnp.asarray(point[None]))[0]) >= self.radius_m:
+            if not float(as_space(self.maze).clearance(point[None])[0]) >= self.radius_m:
                 return NoPath(tuple(ends[0]), tuple(ends[1]), f"the {name} is inside a wall or touches one")
         grown = extend(self, ends)
         n = len(self.points)
@@ -103,7 +121,7 @@ class Roadmap:
         return Path(points, float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
 
 
-def build_roadmap(key: jax.Array, maze: Maze, *, radius_m: float, config: PrmConfig | None = None) -> Roadmap:
+def build_roadmap(key: jax.Array, maze: Maze | Space, *, radius_m: float, config: PrmConfig | None = None) -> Roadmap:
     """Sample a roadmap: points uniform over the collision-free area, edges wherever the swept robot stays free.
 
     Args:
@@ -111,13 +129,14 @@ def build_roadmap(key: jax.Array, maze: Maze, *, radius_m: float, config: PrmCon
         radius_m: of the robot [m]; ``config.margin_m`` is added to it.
 
     Raises:
-        UserError: the maze is too narrow for the robot.
+        UserError: the maze or world is too narrow for the robot.
     """
     config = config or PrmConfig()
     radius = radius_m + config.margin_m
     seed = np.asarray(jax.random.key_data(key)).astype(np.uint32)
     rng = np.random.default_rng(seed)
-    return _connect(_sample_points(rng, maze, radius, config.samples), maze, radius_m, config)
+    points = as_space(maze).sample_free(rng, config.samples, radius).astype(np.float32)
+    return _connect(points, maze, radius_m, config)
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
@@ -126,23 +145,47 @@ def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     return _connect(everything, roadmap.maze, roadmap.radius_m, roadmap.config)
 
 
-def _connect(points: np.ndarray, maze: Maze, radius_m: float, config: PrmConfig) -> Roadmap:
+def _connect(points: np.ndarray, maze: Maze | Space, radius_m: float, config: PrmConfig) -> Roadmap:
     """Join all pairs of points within the connect distance whose straight way is free, in one batched check.
 
     Edges between the first ``config.samples`` points keep the margin; the others, to given points, only the radius.
     """
     pairs = cKDTree(points).query_pairs(config.connect_m, output_type="ndarray").astype(np.int32)
-    reach = segment_reach(config.connect_m, radius_m + config.margin_m, float(maze.cell_m))
-    padded = np.zeros((_bucket(len(pairs)), 2), np.int32)
-    padded[: len(pairs)] = pairs
-    clear = radius_m + config.margin_m * (padded < config.samples).all(1)
-    free = _segments_free(maze, jnp.asarray(points[padded]), jnp.asarray(clear, jnp.float32), reach)
-    edges = pairs[np.asarray(free)[: len(pairs)]]
+    clear = radius_m + config.margin_m * (pairs < config.samples).all(1)
+    edges = pairs[as_space(maze).segment_free(points[pairs[:, 0]], points[pairs[:, 1]], clear)]
     graph = nx.Graph()
     graph.add_nodes_from(range(len(points)))
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     graph.add_weighted_edges_from(zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True))
     return Roadmap(graph, points, edges, maze, radius_m, config)
+
+
+def as_space(maze: Maze | Space) -> Space:
+    """The maze, or what is a space already, as a space."""
+    return MazeSpace(maze) if isinstance(maze, Maze) else maze
+
+
+@dataclass(frozen=True)
+class MazeSpace:
+    """A maze's compiled queries, in NumPy."""
+
+    maze: Maze
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """As ``Space`` says; at most one cell."""
+        return np.asarray(_clearances(self.maze, jnp.asarray(points, jnp.float32)))
+
+    def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """As ``Space`` says."""
+        n, longest = len(a), float(np.linalg.norm(b - a, axis=-1).max(initial=0.0))
+        reach = segment_reach(longest, float(np.max(radius, initial=0.0)), float(self.maze.cell_m))
+        ends, clear = np.zeros((_bucket(n), 2, 2), np.float32), np.zeros(_bucket(n), np.float32)
+        ends[:n, 0], ends[:n, 1], clear[:n] = a, b, radius
+        return np.asarray(_segments_free(self.maze, jnp.asarray(ends), jnp.asarray(clear), reach))[:n]
+
+    def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
+        """As ``Space`` says. Raises UserError where the cells are too narrow."""
+        return _sample_points(rng, self.maze, radius, n)
 
 
 def _bucket(n: int) -> int:

@@ -1,0 +1,380 @@
+"""The Turtlebot3 burger in a cluttered room: one PyBullet simulation, on the CPU (paper, sec. IV-D).
+
+What a policy sees is what the robot itself can give it, in the robot's own frame (x ahead, y to the left): the
+direction of the goal [cos dpsi, sin dpsi], where dpsi is the angle from the heading to the goal; the vector to the goal
+(dx, dy); and the lidar within 1 m as a 2 x 25 x 25 map of 0.08 m cells. The paper gives neither the frame, nor the
+control step, the horizon, the goal tolerance or the penalty. In the robot's frame, raw lidar needs no estimate of the
+yaw, errors of the yaw move no obstacle, and nothing changes when the world is turned; ``frame="world"`` aligns map and
+goal with the world instead, as in the mazes. The other choices are the defaults of ``Turtlebot3Config``.
+
+PyBullet is imported when the first simulation begins: all else works without it.
+"""
+
+import os
+import sys
+import xml.etree.ElementTree as xml
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ct_envs.errors import UserError
+from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_RANGE_M, lidar_map
+from ct_envs.turtlebot3_world import World
+
+WHEEL_RADIUS_M = 0.033  # r
+WHEEL_SEPARATION_M = 0.160  # b
+RADIUS_M = 0.105  # of the body
+TOP_SPEED_MPS = 0.22
+TOP_TURN_RADPS = 2.84
+FRAMES = ("heading", "world")
+
+_LIDAR_M = 0.18  # height of the beams: above the body, below the top of every obstacle
+_HEIGHT_M = 0.5  # of walls and obstacles
+_TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
+_SETTLE = 12  # physics steps in which a robot that was put down comes to rest
+_FRONTAL = np.cos(np.pi / 4)  # a contact within 45 degrees of the way the robot drives is frontal
+_WHEELS = ("wheel_left_joint", "wheel_right_joint")
+# What may touch what: body and obstacles, wheels and floor.
+_FLOOR, _ROLLING, _BODY, _OBSTACLE = 1, 2, 4, 8
+
+
+@dataclass(frozen=True)
+class Turtlebot3Config:
+    """The simulation and the task."""
+
+    control_dt_s: float = 0.2  # between two actions
+    physics_dt_s: float = 1 / 240  # between two steps of PyBullet
+    horizon: int = 400  # control steps of an episode: 80 s, in which the robot drives 17 m
+    goal_tolerance_m: float = 0.2
+    collision_penalty: float = 1.0  # taken off the reward of a step in which the robot touches something
+    frame: str = "heading"  # of map and goal: the robot's "heading" or the "world"
+    urdf: str | None = None  # a URDF file instead of ours
+
+    def __post_init__(self):
+        if self.frame not in FRAMES:
+            raise UserError(f"no frame named '{self.frame}'; frames: {', '.join(FRAMES)}")
+        if not 0 < self.physics_dt_s <= self.control_dt_s:
+            raise UserError(f"physics_dt_s is {self.physics_dt_s}; use more than 0 and at most control_dt_s")
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of a control step."""
+        return round(self.control_dt_s / self.physics_dt_s)
+
+
+class Pose(NamedTuple):
+    """Where the middle of the robot's axle is, in the world."""
+
+    position: np.ndarray  # float64 [2], [m]
+    yaw_rad: float
+
+
+class Touch(NamedTuple):
+    """What the robot touched during a control step."""
+
+    frontal: bool  # something in its way
+    grazing: bool  # something at its side, or behind it
+
+
+class Step(NamedTuple):
+    """What a control step gives."""
+
+    obs: dict[str, np.ndarray]
+    reward: float
+    done: bool
+    info: dict[str, Any]
+
+
+def wheel_speeds(v_mps: Any, omega_radps: Any) -> Any:
+    """Speeds of the left and the right wheel [..., 2] (rad/s) at linear speed v and turning speed omega (sec. IV-D)."""
+    v_mps, omega_radps = np.asarray(v_mps, np.float64), np.asarray(omega_radps, np.float64)
+    left = (v_mps - omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M
+    right = (v_mps + omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M
+    return np.stack([left, right], -1)
+
+
+def speeds(action: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """(v, omega) [m/s, rad/s] of an action: in shares of the top speeds, clipped to [-1, 1]."""
+    return np.clip(action, -1.0, 1.0) * np.array([TOP_SPEED_MPS, TOP_TURN_RADPS])
+
+
+def as_action(v_mps: Any, omega_radps: Any) -> np.ndarray:
+    """The action of (v, omega), clipped: the inverse of ``speeds``."""
+    return np.clip(np.stack([v_mps / TOP_SPEED_MPS, omega_radps / TOP_TURN_RADPS], -1), -1.0, 1.0)
+
+
+def to_heading(vector: Float[np.ndarray, "*n 2"], yaw_rad: Any) -> Float[np.ndarray, "*n 2"]:
+    """A vector of the world in the frame of a robot with this yaw."""
+    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x], -1)
+
+
+def observe(pose: Pose, goal: np.ndarray, ranges: np.ndarray, *, frame: str = "heading") -> dict[str, np.ndarray]:
+    """What a policy sees: ``map`` [2, 25, 25] of bytes, ``proprio`` [cos dpsi, sin dpsi], ``goal`` [2] (m).
+
+    Args:
+        pose: as the robot believes it to be.
+        goal: in the world [m].
+        ranges: of the lidar [360] (m); see ``lidar_map``.
+    """
+    ahead = to_heading(goal - pose.position, pose.yaw_rad)
+    distance = np.linalg.norm(ahead)
+    direction = ahead / distance if distance > 1e-9 else np.array([1.0, 0.0])
+    aligned = frame == "world"
+    vector = goal - pose.position if aligned else ahead
+    picture = lidar_map(ranges, vector, yaw_rad=pose.yaw_rad if aligned else 0.0)
+    return {"map": picture, "proprio": direction.astype(np.float32), "goal": vector.astype(np.float32)}
+
+
+class Turtlebot3Env:
+    """Reach the goal. Reward is minus the distance to it after the step [m], less a penalty where something is touched.
+
+    Action: [-1, 1]^2, shares of 0.22 m/s and 2.84 rad/s. Observation: see ``observe``. An episode ends with success
+    (within the goal tolerance) or, as truncation, at the horizon; a collision does not end it. ``info`` holds
+    ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``
+    and ``ranges``. The same world, start, goal, seed and actions give the same episode, bit for bit, whatever was
+    simulated before.
+    """
+
+    def __init__(self, config: Turtlebot3Config = Turtlebot3Config()):
+        """Raises UserError where PyBullet or the URDF is missing, or the URDF is broken."""
+        self.config = config
+        self._urdf = _urdf_file(config.urdf)
+        self._bullet = load_pybullet()
+        self._client = self._bullet.connect(self._bullet.DIRECT)
+        self._world: World | None = None
+        self._done = True
+
+    def close(self) -> None:
+        """End the simulation."""
+        if self._client >= 0:
+            self._bullet.disconnect(self._client)
+            self._client = -1
+
+    def __enter__(self) -> "Turtlebot3Env":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def reset(
+        self, world: World, start: Any, goal: Any, *, seed: int = 0, yaw_rad: float | None = None
+    ) -> dict[str, np.ndarray]:
+        """The first observation of an episode from ``start`` to ``goal`` [2] (m).
+
+        Args:
+            seed: of what is left to chance: the yaw, where none is given.
+
+        Raises:
+            UserError: a start or goal where the robot cannot stand, or a goal it cannot reach.
+        """
+        start, goal = (np.asarray(point, np.float64) for point in (start, goal))
+        check_task(world, start, goal)
+        if yaw_rad is None:
+            yaw_rad = float(np.random.default_rng(seed).uniform(-np.pi, np.pi))
+        self._world, self._goal, self._steps, self._done = world, goal, 0, False
+        self._build(world, start, yaw_rad)
+        return observe(self.pose, goal, self.lidar(), frame=self.config.frame)
+
+    def step(self, action: Any) -> Step:
+        """One control step. Raises UserError for an action that is not two finite numbers, or after the end."""
+        action = np.asarray(action, np.float64)
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise UserError(f"the action {action.tolist()} is not two finite numbers; give shares of (v, omega)")
+        if self._done:
+            raise UserError("the Turtlebot3's episode is over, or none has begun; call reset first")
+        touch = self._drive(*speeds(action))
+        self._steps += 1
+        pose, ranges = self.pose, self.lidar()
+        distance = float(np.linalg.norm(self._goal - pose.position))
+        collision = touch.frontal or touch.grazing
+        success = distance < self.config.goal_tolerance_m
+        truncation = not success and self._steps >= self.config.horizon
+        self._done = success or truncation
+        info = {
+            "success": success, "collision": collision, "frontal": touch.frontal, "grazing": touch.grazing,
+            "truncation": truncation, "episode_steps": self._steps, "position": pose.position,
+            "yaw_rad": pose.yaw_rad, "ranges": ranges,
+        }  # fmt: skip
+        obs = observe(pose, self._goal, ranges, frame=self.config.frame)
+        return Step(obs, -distance - self.config.collision_penalty * collision, self._done, info)
+
+    @property
+    def pose(self) -> Pose:
+        """Where the robot is."""
+        position, quat = self._bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
+        x, y, z, w = quat
+        return Pose(np.array(position[:2]), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
+
+    def lidar(self) -> np.ndarray:
+        """Ranges [360] (m): beam i is i degrees to the left of the heading; ``LIDAR_RANGE_M`` where nothing is met."""
+        position, yaw = self.pose
+        angle = yaw + np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS)
+        begin = np.tile(np.append(position, _LIDAR_M), (LIDAR_BEAMS, 1))
+        end = begin + LIDAR_RANGE_M * np.stack([np.cos(angle), np.sin(angle), np.zeros(LIDAR_BEAMS)], -1)
+        hits = self._bullet.rayTestBatch(begin.tolist(), end.tolist(), physicsClientId=self._client)
+        return LIDAR_RANGE_M * np.array([hit[2] for hit in hits])
+
+    def _build(self, world: World, start: np.ndarray, yaw_rad: float) -> None:
+        """Everything anew: an old simulation's caches would make the episode depend on the one before."""
+        p, client = self._bullet, {"physicsClientId": self._client}
+        p.resetSimulation(**client)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=self.config.physics_dt_s, deterministicOverlappingPairs=1, **client
+        )  # fmt: skip
+        p.setGravity(0.0, 0.0, -9.81, **client)
+        floor = p.createMultiBody(0, p.createCollisionShape(p.GEOM_PLANE, **client), **client)
+        p.changeDynamics(floor, -1, lateralFriction=1.0, **client)
+        p.setCollisionFilterGroupMask(floor, -1, _FLOOR, _ROLLING, **client)
+        for x, y, half_x, half_y, yaw in [*_walls(world.side_m), *world.boxes.tolist()]:
+            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[half_x, half_y, _HEIGHT_M / 2], **client)
+            self._put(shape, x, y, yaw)
+        for x, y, radius in world.cylinders.tolist():
+            self._put(p.createCollisionShape(p.GEOM_CYLINDER, radius=radius, height=_HEIGHT_M, **client), x, y, 0.0)
+        self._load_robot(start, yaw_rad)
+        for _ in range(_SETTLE):
+            p.stepSimulation(**client)
+
+    def _put(self, shape: int, x: float, y: float, yaw: float) -> None:
+        """An obstacle that does not move."""
+        p, client = self._bullet, {"physicsClientId": self._client}
+        quat = p.getQuaternionFromEuler([0.0, 0.0, yaw])
+        body = p.createMultiBody(0, shape, -1, [x, y, _HEIGHT_M / 2], quat, **client)
+        p.changeDynamics(body, -1, lateralFriction=0.5, restitution=0.0, **client)
+        p.setCollisionFilterGroupMask(body, -1, _OBSTACLE, _BODY, **client)
+
+    def _load_robot(self, start: np.ndarray, yaw_rad: float) -> None:
+        p, client = self._bullet, {"physicsClientId": self._client}
+        place = [*start.tolist(), WHEEL_RADIUS_M], p.getQuaternionFromEuler([0.0, 0.0, yaw_rad])
+        try:
+            with _quiet():
+                self._robot = p.loadURDF(str(self._urdf), *place, flags=p.URDF_USE_IMPLICIT_CYLINDER, **client)
+        except p.error:
+            raise UserError(f"{self._urdf}: PyBullet cannot load it; compare it with ours") from None
+        joints = [p.getJointInfo(self._robot, i, **client) for i in range(p.getNumJoints(self._robot, **client))]
+        number = {info[1].decode(): info[0] for info in joints}
+        self._wheels = [number[name] for name in _WHEELS]
+        for link in range(-1, len(joints)):
+            rolls = link in self._wheels
+            friction = 1.0 if rolls else 0.2 if link == -1 else 0.0
+            p.changeDynamics(
+                self._robot, link, lateralFriction=friction, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0,
+                **client,
+            )  # fmt: skip
+            group = (_BODY, _OBSTACLE) if link == -1 else (_ROLLING, _FLOOR)
+            p.setCollisionFilterGroupMask(self._robot, link, *group, **client)
+        self._command(0.0, 0.0)
+
+    def _command(self, v_mps: float, omega_radps: float) -> None:
+        p = self._bullet
+        p.setJointMotorControlArray(
+            self._robot, self._wheels, p.VELOCITY_CONTROL, targetVelocities=wheel_speeds(v_mps, omega_radps).tolist(),
+            forces=[_TORQUE_NM] * 2, physicsClientId=self._client,
+        )  # fmt: skip
+
+    def _drive(self, v_mps: float, omega_radps: float) -> Touch:
+        """Hold the wheels' speeds for a control step, and tell what was touched."""
+        self._command(v_mps, omega_radps)
+        assert self._world is not None
+        # How far the robot could come: where nothing is that near, nobody need look for contacts.
+        reach = RADIUS_M + 1.5 * TOP_SPEED_MPS * self.config.control_dt_s + 0.02
+        near = float(self._world.clearance(self.pose.position)) < reach
+        frontal = grazing = False
+        for _ in range(self.config.substeps):
+            self._bullet.stepSimulation(physicsClientId=self._client)
+            if near:
+                now = self._touching(np.sign(v_mps) or 1.0)
+                frontal, grazing = frontal or now.frontal, grazing or now.grazing
+        return Touch(frontal, grazing)
+
+    def _touching(self, direction: float) -> Touch:
+        """Contacts of the body now, by their normals; ``direction`` is -1 where the robot drives backwards."""
+        contacts = self._bullet.getContactPoints(bodyA=self._robot, linkIndexA=-1, physicsClientId=self._client)
+        pressed = [contact[7] for contact in contacts if contact[9] > 0.0]
+        if not pressed:
+            return Touch(False, False)
+        yaw = self.pose.yaw_rad
+        way = direction * np.array([np.cos(yaw), np.sin(yaw)])
+        frontal = -np.array(pressed)[:, :2] @ way > _FRONTAL  # the normals point at the robot
+        return Touch(bool(frontal.any()), bool((~frontal).any()))
+
+
+def check_task(world: World, start: np.ndarray, goal: np.ndarray) -> None:
+    """Raises UserError for a start or goal [2] (m) where the robot cannot stand, or a goal it cannot reach."""
+    for name, point in (("start", start), ("goal", goal)):
+        if point.shape != (2,) or not np.isfinite(point).all():
+            raise UserError(f"the {name} {point.tolist()} is not a point; give x and y in metres")
+        if float(world.clearance(point)) < RADIUS_M:
+            x, y = point
+            raise UserError(f"the {name} ({x:.2f}, {y:.2f}) is in an obstacle or wall, or too near; move it away")
+    if not world.reachable(start, goal, RADIUS_M):
+        x, y = goal
+        raise UserError(f"the goal ({x:.2f}, {y:.2f}) is out of the robot's reach from this start; move one of them")
+
+
+def load_pybullet() -> ModuleType:
+    """PyBullet. Raises UserError where it is not installed."""
+    try:
+        with _quiet():
+            import pybullet
+    except ImportError:
+        raise UserError(
+            "the Turtlebot3 needs PyBullet, which is not installed and has no wheel past Python 3.11; "
+            "use Python 3.11 and pip install 'control-transformer-jax[turtlebot3]' (all other robots work without)"
+        ) from None
+    return pybullet
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps what C code writes to stdout and stderr from the terminal: PyBullet greets, and warns of what is well."""
+    streams = sys.stdout, sys.stderr
+    for stream in streams:
+        stream.flush()
+    saved = os.dup(1), os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 1)
+        os.dup2(sink, 2)
+        yield
+    finally:
+        for stream in streams:
+            stream.flush()
+        for number, copy in enumerate(saved, 1):
+            os.dup2(copy, number)
+            os.close(copy)
+        os.close(sink)
+
+
+def _urdf_file(name: str | None) -> Path:
+    """The URDF, looked through. Raises UserError where it is missing, or lacks the wheels."""
+    path = Path(name or str(resources.files("ct_envs") / "assets" / "turtlebot3_burger.urdf"))
+    if not path.is_file():
+        raise UserError(f"no URDF file '{path}'; leave urdf out to use the Turtlebot3's own")
+    try:
+        robot = xml.fromstring(path.read_bytes())
+    except xml.ParseError as bad:
+        raise UserError(f"{path}:{bad.position[0]}: not XML ({bad.msg.split(':')[0]}); mend that line") from None
+    joints = {joint.get("name") for joint in robot.iter("joint")}
+    missing = [name for name in _WHEELS if name not in joints]
+    if missing:
+        raise UserError(f"{path}: has no joint {' and no '.join(missing)}; the wheels' joints must be named so")
+    return path
+
+
+def _walls(side_m: float) -> list[tuple[float, float, float, float, float]]:
+    """The room's four walls as boxes, outside the room."""
+    thick, middle = 0.1, side_m / 2
+    low, high, half = -thick, side_m + thick, middle + 2 * thick
+    return [
+        (middle, low, half, thick, 0.0), (middle, high, half, thick, 0.0),
+        (low, middle, thick, half, 0.0), (high, middle, thick, half, 0.0),
+    ]  # fmt: skip
