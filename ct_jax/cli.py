@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,7 +53,7 @@ class Train:
     """
 
     robot: Annotated[Positional[str], arg(metavar="ROBOT")]
-    """Robot to train: point."""
+    """Robot to train: point or ant."""
     preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
     """How much of everything: demo (minutes), cpu (an hour on two cores), published (the bare method at that size) or
     paper (the published sizes; wants a GPU)."""
@@ -65,6 +65,8 @@ class Train:
     """Maze to train in, by name or text file. By default the paper's, antmaze-large."""
     eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
     """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
+    controller: Annotated[str, arg(metavar="own|zoo|RUN")] = "own"
+    """Low-level controller: learn one's own, take the one that ships with the package, or that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
     """Physics; auto is mujoco on CPU and mjx on accelerators."""
     resume: FlagCreatePairsOff[bool] = False
@@ -244,7 +246,7 @@ def _train(command: Train) -> None:
         folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
         robot=command.robot,
         preset=command.preset,
-        settings=get_preset(command.preset),
+        settings=replace(get_preset(command.preset, command.robot), controller=command.controller),
         mazes=load_mazes(command.maze or seen),
         eval_mazes=load_mazes(command.eval_maze or unseen),
         seed=command.seed,

@@ -29,6 +29,7 @@ class RecoverConfig:
     recoveries: int = 500  # T
     stuck_steps: int = 40  # failure: in so many steps ...
     stuck_m: float = 4.0  # ... the robot moved less than this [m]
+    bumps: int | None = None  # failure: the robot touched a wall in so many of the last ``stuck_steps``
     patience: int = 200  # failure: not at the goal after so many steps
     takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
     keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
@@ -43,6 +44,7 @@ class Watching:
     own: Any
     guided: Any
     past: Float[Array, "W N 2"]  # positions of the last steps [m]
+    touched: Float[Array, "W N"]  # collisions of the last steps
     steps: Int[Array, ""]
     rescued: Bool[Array, "N"]
 
@@ -58,7 +60,8 @@ class Supervised:
     def init(self, state: State, own: Any, guided: Any) -> Watching:
         n = state.done.shape[0]
         past = jnp.full((self.config.stuck_steps, n, 2), jnp.inf)
-        return Watching(own, guided, past, jnp.zeros((), jnp.int32), jnp.zeros(n, bool))
+        touched = jnp.zeros((self.config.stuck_steps, n))
+        return Watching(own, guided, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(n, bool))
 
     def act(self, memory: Watching, state: State, key: jax.Array) -> tuple[Action, Watching]:
         own_key, guided_key, chance_key = jax.random.split(key, 3)
@@ -73,11 +76,14 @@ class Supervised:
         else:
             action = action._replace(learn=rescued.astype(jnp.float32))
         past = jnp.concatenate([memory.past[1:], position[None]])
-        return action, Watching(own_memory, guided_memory, past, memory.steps + 1, rescued)
+        touched = jnp.concatenate([memory.touched[1:], state.info["collision"][None]])
+        return action, Watching(own_memory, guided_memory, past, touched, memory.steps + 1, rescued)
 
     def _failed(self, memory: Watching, position: jax.Array) -> Bool[Array, "N"]:
-        """f(s): stuck in a place, or out of patience."""
+        """f(s): stuck in a place, against walls time and again, or out of patience. (A fall ends the episode.)"""
         stuck = jnp.linalg.norm(position - memory.past[0], axis=-1) < self.config.stuck_m
+        if self.config.bumps is not None:
+            stuck |= memory.touched.sum(0) >= self.config.bumps
         return stuck | (memory.steps >= self.config.patience)
 
 
@@ -120,7 +126,10 @@ def recover(
         state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
         data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
         rescued = np.asarray(state.info["success"]) > 0
-        if config.keep != "relabelled":  # there, the transformer's own successes are told what is better, too
+        if config.keep == "relabelled":  # the transformer's own successes are told what is better, too, and its falls
+            fell = np.asarray(state.info["fall"]) > 0
+            data, rescued = lie_for_ever(data, fell, env.horizon), rescued | fell
+        else:
             rescued &= data.learn.sum(1) > 0
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
         recoveries, episodes = recoveries + int(rescued.sum()), episodes + collecting.envs
@@ -128,6 +137,14 @@ def recover(
     if not recoveries:
         raise UserError(f"no recovery in {episodes} episodes; the policy hardly fails, so skip fine-tuning")
     return concatenate(kept)
+
+
+def lie_for_ever(data: Trajectories, fell: Bool[Array, "N"], horizon: int) -> Trajectories:
+    """The trajectories, with falls paid as if the robot lay there until the horizon: a short one is not a good one."""
+    row, last = np.flatnonzero(fell), np.asarray(data.length)[fell] - 1
+    reward = np.array(data.reward)
+    reward[row, last] *= horizon - last
+    return data.replace(reward=reward)
 
 
 def _split(data: Trajectories) -> list[Trajectories]:

@@ -3,7 +3,7 @@
 ``weights.safetensors`` holds the arrays, ``model.json`` the robot, the settings and where they came from.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from brax.training.acme import running_statistics, specs
 from ct_envs import MazeEnv, UserError
 from ct_envs.robots import get_robot
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
-from ct_jax.controllers.sac import SacController, controller_networks, input_size
+from ct_jax.controllers.sac import SacConfig, SacController, controller_networks, input_size
 from ct_jax.policy import TransformerPolicy
-from ct_jax.presets import Settings, from_dict, to_dict
+from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -31,7 +31,7 @@ class TrainedModel:
     robot: str
     settings: Settings
     policy: TransformerPolicy
-    controller: SacController
+    controller: SacController  # as ``settings.sac`` describes it
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
 
@@ -95,6 +95,46 @@ def load_model(run: str) -> TrainedModel:
     return TrainedModel(robot, settings, policy, controller, made)
 
 
+def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
+    """Write a controller into a folder: ``weights.safetensors``, and last ``controller.json``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_weights(folder / "weights.safetensors", controller)
+    write_json(folder / "controller.json", _sizes(robot) | {"format": 1, "sac": asdict(config), "made": made})
+
+
+def load_controller(where: str, robot: str) -> tuple[SacController, SacConfig]:
+    """Read the controller of a robot from a run folder, a controller's folder, or with "zoo" the shipped one.
+
+    Raises:
+        UserError: there is none, it is damaged, or it is another robot's (both are described).
+    """
+    if where == "zoo":
+        folder = Path(str(resources.files("ct_jax") / "zoo" / "controllers" / robot))
+    else:
+        folder = next((f for f in (Path(where) / "controller", Path(where)) if (f / "controller.json").is_file()), None)
+    if folder is None or not (folder / "controller.json").is_file():
+        raise UserError(f"no controller of robot '{robot}' in '{where}'; give a run folder, 'zoo', or learn your 'own'")
+    file = folder / "controller.json"
+    mend = "give another, or learn your 'own'"
+    found = read_json(file, mend=mend)
+    sizes = {name: found.get(name) for name in _sizes(robot)}
+    if sizes != _sizes(robot):
+        words = [", ".join(f"{name} {value}" for name, value in each.items()) for each in (sizes, _sizes(robot))]
+        raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {mend}")
+    try:
+        config = sac_from_dict(found["sac"])
+    except (KeyError, TypeError, AttributeError) as bad:
+        raise UserError(f"{file}: not a controller's description ({bad}); {mend}") from None
+    blank = blank_model(robot, Settings(sac=config))[1]
+    return jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", blank, mend=mend)), config
+
+
+def _sizes(robot: str) -> dict[str, Any]:
+    """What a controller must agree in with its robot."""
+    env = MazeEnv(get_robot(robot), engine="mujoco")
+    return {"robot": robot, "proprio": env.proprio_size, "actions": env.action_size}
+
+
 def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController]:
     """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
     env = MazeEnv(get_robot(robot), engine="mujoco")
@@ -119,6 +159,7 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
             action_size=env.action_size,
             hidden=settings.sac.hidden,
             frame=settings.sac.frame,
+            effort=settings.sac.effort,
         )
         return policy, controller
 

@@ -19,11 +19,11 @@ from ct_envs.robots import Robot
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
 from ct_jax.collect import collect
-from ct_jax.controllers.sac import SacController, train_controller
+from ct_jax.controllers.sac import SacConfig, SacController, train_controller
 from ct_jax.evaluate import METHODS, Episodes, Pairs, draw_pairs, evaluate
 from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
-from ct_jax.model import TrainedModel, blank_model, load_model, save_model
+from ct_jax.model import TrainedModel, blank_model, load_controller, load_model, save_controller, save_model
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
@@ -62,16 +62,19 @@ def _model(run: Run, metrics: Metrics) -> TrainedModel:
     folder = run.folder / "model"
     if run.done(last) is not None and (folder / "model.json").is_file():
         return load_model(str(run.folder))
-    controller = _controller(run, metrics)
+    controller, sac = _controller(run, metrics)
     data = _collect(run, controller)
     policy = _fit(run, data, metrics)
     if run.settings.rounds:
         policy = _finetune(run, policy, controller, data, metrics)
-    config = read_json(run.folder / "config.json")
-    made = {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
-    model = TrainedModel(run.robot, run.settings, policy, controller, made)
+    model = TrainedModel(run.robot, replace(run.settings, sac=sac), policy, controller, _made(run))
     save_model(folder, model)
     return model
+
+
+def _made(run: Run) -> dict[str, Any]:
+    config = read_json(run.folder / "config.json")
+    return {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
 
 
 # ------------------------------------------------------------------------------------------ roadmap and controller
@@ -88,12 +91,13 @@ def _prm(run: Run) -> Roadmap:
     return roadmap
 
 
-def _controller(run: Run, metrics: Metrics) -> SacController:
+def _controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
+    """The run's own controller, or the given one, and its configuration."""
     config = run.settings.sac
-    file = run.folder / "controller" / "weights.safetensors"
+    if run.settings.controller != "own":
+        return load_controller(run.settings.controller, run.robot)
     if run.done("controller") is not None:
-        _, blank = blank_model(run.robot, run.settings)
-        return _read_weights(run, file, blank)
+        return load_controller(str(run.folder), run.robot)
     roadmap = _prm(run)
     with run.stage("controller") as (folder, info), Bar("controller", config.iterations) as bar:
         checkpoints = Checkpoints(folder / "checkpoints")
@@ -107,10 +111,10 @@ def _controller(run: Run, metrics: Metrics) -> SacController:
             on_progress=on_progress, checkpoints=checkpoints,
         )  # fmt: skip
         checkpoints.close()
-        save_weights(file, controller)
+        save_controller(folder, run.robot, config, controller, _made(run) | {"held_out_success": held_out})
         info |= {"held_out_success": held_out}
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    return controller
+    return controller, config
 
 
 def _read_weights(run: Run, file: Path, like: Any) -> Any:
@@ -273,7 +277,7 @@ def _evaluate(run: Run, model: TrainedModel) -> None:
     with run.stage("evaluate") as (folder, _):
         rows = []
         for name, maze in join_mazes(run.mazes, run.eval_mazes).items():
-            pairs = stored_pairs(folder, run.spec, name, maze, run.settings.episodes, run.seed)
+            pairs = stored_pairs(folder, run.spec, name, maze, run.settings.episodes, run.settings.pairs_seed)
             for method in METHODS:
                 file = folder / f"{slug(name)}-{method}.json"
                 if not file.is_file():

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ct_envs import UserError
+from ct_envs.robots import get_robot
 from ct_jax.collect import CollectConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import RecoverConfig
@@ -17,6 +18,7 @@ class Settings:
     """Everything a run depends on besides its robot, mazes, engine and seed."""
 
     prm: PrmConfig = PrmConfig()
+    controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
     sac: SacConfig = SacConfig()
     collect: CollectConfig = CollectConfig()
     model: ModelConfig = ModelConfig()
@@ -29,6 +31,7 @@ class Settings:
     optimism: float = 1.0  # k: ask for k * V (paper, sec. III-C)
     reprompt: bool = False  # never ask for more than V of the present state
     episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
+    pairs_seed: int = 0  # their seed: not the run's, so that all models meet the same pairs
 
 
 PAPER = Settings(
@@ -79,11 +82,37 @@ DEMO = replace(
 PRESETS = {"demo": DEMO, "cpu": CPU, "published": PUBLISHED, "paper": PAPER}
 
 
-def get_preset(name: str) -> Settings:
-    """The preset of that name. Raises UserError with the valid names."""
+_ANT_SAC = SacConfig(
+    envs=128,
+    iterations=24_000,
+    updates=16,
+    warmup=50,
+    arrival_bonus=50.0,
+    reward_scale=0.1,
+    replay=1_000_000,
+    episode_steps=80,
+    reset_velocity_mps=0.1,
+    frame="heading",
+    mirror=True,
+    chain=True,
+)
+
+
+def _for_ant(settings: Settings) -> Settings:
+    """A controller that has to balance, slower walks, and for what lifts the method a head that knows the heading."""
+    model = replace(settings.model, frame="heading") if settings.reprompt else settings.model
+    collect = replace(settings.collect, horizon=700)
+    return replace(settings, sac=_ANT_SAC, collect=collect, model=model)
+
+
+_ADAPTED = {"point": lambda settings: settings, "ant": _for_ant}
+
+
+def get_preset(name: str, robot: str = "point") -> Settings:
+    """The preset of that name for a robot. Raises UserError with the valid names."""
     if name not in PRESETS:
         raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(PRESETS))}")
-    return PRESETS[name]
+    return _ADAPTED[get_robot(robot).name](PRESETS[name])
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:
@@ -98,7 +127,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
         return replace(
             Settings(**{k: v for k, v in values.items() if not isinstance(v, dict)}),
             prm=PrmConfig(**values["prm"]),
-            sac=SacConfig(**values["sac"] | {"hidden": tuple(values["sac"]["hidden"])}),
+            sac=sac_from_dict(values["sac"]),
             collect=CollectConfig(**values["collect"]),
             model=ModelConfig(**values["model"]),
             value=ValueConfig(**value),
@@ -108,3 +137,8 @@ def from_dict(values: dict[str, Any]) -> Settings:
         )
     except (KeyError, TypeError, AttributeError) as bad:
         raise UserError(f"settings of another version ({bad}); train again") from None
+
+
+def sac_from_dict(values: dict[str, Any]) -> SacConfig:
+    """The controller's part of ``from_dict``."""
+    return SacConfig(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from ct_envs import UserError
 from ct_envs.frames import Symmetries
@@ -100,7 +100,7 @@ def load(file: Path) -> Trajectories:
 class Window:
     """A batch of pieces of trajectories, S steps each."""
 
-    map: Float[Array, "B S 2 k k"]
+    map: UInt8[Array, "B S 2 k k"]
     proprio: Float[Array, "B S P"]
     goal: Float[Array, "B S 2"]  # from the robot to the final goal [m]
     action: Float[Array, "B S A"]
@@ -109,6 +109,7 @@ class Window:
     timestep: Int[Array, "B S"]
     valid: Float[Array, "B S"]  # 1 where there is a step
     learn: Float[Array, "B S"]  # 1 where the target is to be imitated
+    reward: Float[Array, "B S"]  # after the action
 
 
 def sample_windows(
@@ -122,6 +123,7 @@ def sample_windows(
     map_cell_m: float,
     symmetries: Symmetries | None = None,
     shift_timestep: int = 0,
+    overhang: int = 0,
 ) -> Window:
     """Draw pieces of ``steps`` steps: a trajectory by its length, and any of its whole pieces alike.
 
@@ -130,13 +132,15 @@ def sample_windows(
         mazes: stacked; ``trajectories.maze`` points into it.
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
+        overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
     # pieces may begin at any step that leaves them full, or at the start of a short trajectory
-    first = (jax.random.uniform(where_key, (batch,)) * (jnp.maximum(length - steps, 0) + 1)).astype(jnp.int32)
+    places = jnp.maximum(length + overhang - steps, 0) + 1
+    first = (jax.random.uniform(where_key, (batch,)) * places).astype(jnp.int32)
     at = first[:, None] + jnp.arange(steps)[None]
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
@@ -154,6 +158,7 @@ def sample_windows(
         timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1),
         valid=valid.astype(jnp.float32),
         learn=valid * take(trajectories.learn),
+        reward=take(trajectories.reward),
     )
     if symmetries is None:
         return window

@@ -11,13 +11,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from ct_envs.frames import own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
 
 TOKENS = 3  # of a step: return-to-go, state, action
 GOAL_SCALE_M = 10.0  # goal vectors are divided by this
 RETURN_SCALE = 1000.0  # returns are divided by this
+SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class ModelConfig:
     max_timestep: int = 1024  # embeddings of the absolute timestep
     map_cell_m: float = 0.8  # side of a cell of the local map [m]
     returns: bool = True  # condition on returns; without them this is BC-CT
+    frame: str = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
+    directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
 
 
 _NEVER = -(10**6)  # the step of a token that is not there
@@ -63,7 +67,8 @@ class MapEncoder(nn.Module):
     patch: int = 5
 
     @nn.compact
-    def __call__(self, maps: Float[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
+    def __call__(self, maps: UInt8[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
+        maps = maps.astype(jnp.float32)
         lead, n, p = maps.shape[:-3], maps.shape[-1] // self.patch, self.patch
         x = maps.reshape(*lead, 2, n, p, n, p)
         x = jnp.moveaxis(x, (-5, -3, -1), (-3, -2, -1)).reshape(*lead, n, n, 2 * p * p)
@@ -106,6 +111,34 @@ class Block(nn.Module):
         return x + self.dropout(hidden, deterministic=deterministic)
 
 
+def body_features(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:
+    """The heading, and the body in its own frame with all entries of order one."""
+    heading, own = own_frame(proprio)
+    poses = 4 + (own.shape[-1] - 10) // 2  # height, up and joints; velocities come after them
+    return heading, jnp.concatenate([own[..., :poses], own[..., poses:] / SPEED_SCALE], -1)
+
+
+class HeadingHead(nn.Module):
+    """Actions of a robot that can turn: where to go in the world, turned into the robot's frame, and how it stands.
+
+    The same gait then serves every heading, and the trunk need not know which way the body looks.
+    """
+
+    directions: int
+    action_size: int
+    width: int = 256
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b A"]:
+        heading, own = body_features(proprio)
+        where = nn.Dense(2 * self.directions)(x)
+        where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], self.directions, 2))
+        hidden = jnp.concatenate([where.reshape(*where.shape[:-2], -1), own], -1)
+        for _ in range(2):
+            hidden = nn.relu(nn.Dense(self.width)(hidden))
+        return nn.Dense(self.action_size)(hidden)
+
+
 class ControlTransformer(nn.Module):
     """pi_theta(a_t | R_{t-K+1..t}, s_{t-K+1..t}, a_{t-K+1..t-1})."""
 
@@ -123,7 +156,10 @@ class ControlTransformer(nn.Module):
         self.norm_in, self.norm_out = nn.LayerNorm(), nn.LayerNorm()
         self.dropout = nn.Dropout(c.dropout)
         self.blocks = [Block(c) for _ in range(c.layers)]
-        self.predict_action = nn.Dense(self.action_size)
+        if c.frame == "heading":
+            self.head = HeadingHead(c.directions, self.action_size)
+        else:
+            self.predict_action = nn.Dense(self.action_size)
 
     def _embed_time(self, timestep: jax.Array) -> jax.Array:
         """The embedding of the absolute timestep, shared by the tokens of a step."""
@@ -136,11 +172,18 @@ class ControlTransformer(nn.Module):
     def _embed_state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:
         """Map, proprioception and goal joined into one embedding."""
         goal = self.embed_goal(goal_features(goal))
+        if self.config.frame == "heading":
+            proprio = jnp.concatenate(body_features(proprio), -1)
         return self.embed_state(jnp.concatenate([self.encode_map(maps), proprio, goal], -1))
+
+    def _predict(self, x: jax.Array, proprio: jax.Array) -> jax.Array:
+        """Actions from what the trunk makes of state tokens."""
+        x = self.norm_out(x)
+        return self.head(x, proprio) if self.config.frame == "heading" else self.predict_action(x)
 
     def __call__(
         self,
-        maps: Float[Array, "B S 2 k k"],
+        maps: UInt8[Array, "B S 2 k k"],
         proprio: Float[Array, "B S P"],
         goal: Float[Array, "B S 2"],
         action: Float[Array, "B S A"],
@@ -166,12 +209,12 @@ class ControlTransformer(nn.Module):
         q, k, v = self.blocks[-1].heads(x)
         states = slice(1, None, TOKENS)
         x = self.blocks[-1].attend(x[:, states], q[:, states], k, v, mask[:, states], deterministic)
-        return self.predict_action(self.norm_out(x))
+        return self._predict(x, proprio)
 
     def act(
         self,
         cache: Cache,
-        maps: Float[Array, "N 2 k k"],
+        maps: UInt8[Array, "N 2 k k"],
         proprio: Float[Array, "N P"],
         goal: Float[Array, "N 2"],
         rtg: Float[Array, "N"],
@@ -196,7 +239,7 @@ class ControlTransformer(nn.Module):
             keys.append(jax.lax.dynamic_update_slice(old_keys, k, (0, place, 0, 0)))
             values.append(jax.lax.dynamic_update_slice(old_values, v, (0, place, 0, 0)))
             x = block.attend(x, q, keys[-1], values[-1], mask, True)
-        action = jnp.clip(self.predict_action(self.norm_out(x[:, 2])), -1.0, 1.0)
+        action = jnp.clip(self._predict(x[:, 2], proprio), -1.0, 1.0)
         return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
 
 
@@ -222,6 +265,6 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
 def sample_inputs(proprio_size: int, action_size: int) -> tuple[jax.Array, ...]:
     """Inputs of one step, from which parameters are initialised."""
     one = jnp.zeros((1, 1))
-    maps = jnp.zeros((1, 1, 2, MAP_CELLS, MAP_CELLS))
+    maps = jnp.zeros((1, 1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8)
     proprio, goal, action = (jnp.zeros((1, 1, size)) for size in (proprio_size, 2, action_size))
     return maps, proprio, goal, action, one, jnp.zeros((1, 1), jnp.int32), one

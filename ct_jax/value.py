@@ -2,7 +2,7 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder, goal_features
 
@@ -14,7 +14,7 @@ class ValueNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, maps: Float[Array, "*b 2 k k"], proprio: Float[Array, "*b P"], goal: Float[Array, "*b 2"]
+        self, maps: UInt8[Array, "*b 2 k k"], proprio: Float[Array, "*b P"], goal: Float[Array, "*b 2"]
     ) -> Float[Array, "*b"]:
         """Expected return [m], at most 0."""
         distance = jnp.linalg.norm(goal, axis=-1, keepdims=True)

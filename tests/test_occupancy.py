@@ -114,6 +114,6 @@ def test_the_cell_size_scales_the_window(seed):
 def test_maps_are_small_arrays_of_zeros_and_ones():
     picture = np.asarray(draw(load_maze("hall"), np.float32([6, 6]), np.float32([7, 7]), np.float32(0.8)))
     assert picture.shape == (2, MAP_CELLS, MAP_CELLS) == (2, 25, 25)
-    assert picture.dtype == np.float32
-    assert set(np.unique(picture)) == {0.0, 1.0}
+    assert picture.dtype == np.uint8
+    assert set(np.unique(picture)) == {0, 1}
     assert picture[0, 12, 12] == 0

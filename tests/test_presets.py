@@ -11,10 +11,14 @@ from ct_jax.finetune import KEEP
 from ct_jax.fit import FitConfig
 from ct_jax.presets import PRESETS, Settings, from_dict, get_preset, to_dict
 
-ALL = PRESETS | {
-    "default": Settings(),
-    "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
-}
+ALL = (
+    PRESETS
+    | {f"{name} for the ant": get_preset(name, "ant") for name in PRESETS}
+    | {
+        "default": Settings(),
+        "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
+    }
+)
 
 
 @pytest.mark.parametrize("name", ALL)

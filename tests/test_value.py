@@ -23,7 +23,8 @@ def observations(seed: int, n: int):
 def window(maps, proprio, goal, rtg, valid=None) -> Window:
     one = jnp.ones(rtg.shape)
     none = jnp.zeros((*rtg.shape, 2))
-    return Window(maps, proprio, goal, none, none, rtg, one.astype(jnp.int32), one if valid is None else valid, 0 * one)
+    valid = one if valid is None else valid
+    return Window(maps, proprio, goal, none, none, rtg, one.astype(jnp.int32), valid, 0 * one, 0 * one)
 
 
 apply = jax.jit(MODEL.apply)

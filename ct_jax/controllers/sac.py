@@ -45,7 +45,10 @@ class SacConfig:
     discount: float = 0.97
     initial_temperature: float = 0.1
     arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
-    fall_m: float = 5.0  # a fall costs what lying for ever this much farther from the goal would [m]
+    fall_m: tuple[float, float] = (5.0, 40.0)  # a fall costs what lying for ever this much farther off would [m]: at
+    # first, while each attempt to walk ends in one, and from halfway through the training on
+    tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
+    effort: float = 1.0  # share of the actuators' range that the controller uses
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
     replay: int = 200_000  # transitions kept
     episode_steps: int = 60  # control steps to walk an edge
@@ -73,10 +76,6 @@ class SacState:
     env: State
     key: jax.Array
     iteration: jax.Array
-
-
-def _observe(state: State) -> jax.Array:
-    return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
 
 
 FRAMES = ("world", "heading")
@@ -116,12 +115,13 @@ class SacController:
     action_size: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
     frame: str = struct.field(pytree_node=False, default="world")
+    effort: float = struct.field(pytree_node=False, default=1.0)
 
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
         inputs = controller_inputs(jnp.concatenate([proprio, goal], -1), self.frame)
         networks = controller_networks(inputs.shape[-1], self.action_size, self.hidden)
         logits = networks.policy_network.apply(self.normalizer, self.policy, inputs)
-        return networks.parametric_action_distribution.mode(logits)
+        return self.effort * networks.parametric_action_distribution.mode(logits)
 
 
 def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Tasks]:
@@ -156,7 +156,12 @@ def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
 
 
 class Sac:
-    """The learner: ``create`` and ``train`` on states, both pure."""
+    """The learner: ``create`` and ``train`` on states, both pure.
+
+    What it keeps of a state, what its networks see of that, and the networks are methods, for other tasks to replace.
+    """
+
+    kept = 2  # numbers that the replay keeps of a state besides proprioception
 
     def __init__(self, env: MazeEnv, config: SacConfig):
         """
@@ -170,7 +175,8 @@ class Sac:
         self.env, self.config = env, config
         self._symmetries = symmetries(env.robot) if config.mirror else None
         self._input_size = input_size(env.proprio_size, config.frame)
-        self.networks = controller_networks(self._input_size, env.action_size, config.hidden)
+        self.networks = self._make_networks()
+        self.reward = env.robot.controller_reward
         self._optimizer = optax.adam(config.learning_rate)
         alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
             self.networks, reward_scaling=config.reward_scale, discounting=config.discount, action_size=env.action_size
@@ -179,7 +185,7 @@ class Sac:
         self._alpha_update = update(alpha_loss, self._optimizer)
         self._critic_update = update(critic_loss, self._optimizer)
         self._actor_update = update(actor_loss, self._optimizer)
-        size = env.proprio_size + 2
+        size = env.proprio_size + self.kept
         example = Transition(
             observation=jnp.zeros(size),
             action=jnp.zeros(env.action_size),
@@ -191,7 +197,23 @@ class Sac:
         self._buffer = replay_buffers.UniformSamplingQueue(config.replay, example, config.batch)
         self.train = jax.jit(self._train, static_argnames="iterations")
 
-    def create(self, key: jax.Array, maze: Maze, tasks: Tasks) -> SacState:
+    def _make_networks(self) -> sac_networks.SACNetworks:
+        return controller_networks(self._input_size, self.env.action_size, self.config.hidden)
+
+    def _observe(self, state: State) -> Float[Array, "N P+kept"]:
+        """What the replay keeps of a state."""
+        return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
+
+    def _see(self, observation: Float[Array, "N P+kept"], maze: Maze) -> Any:
+        """What the networks see of it, in that maze."""
+        del maze
+        return controller_inputs(observation, self.config.frame)
+
+    def _watch(self, normalizer: Any, inputs: Any) -> Any:
+        """The running statistics after these inputs."""
+        return running_statistics.update(normalizer, inputs)
+
+    def create(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> SacState:
         """The state before training, in one maze with the given edges."""
         policy_key, critic_key, buffer_key, env_key, key = jax.random.split(key, 5)
         policy = self.networks.policy_network.init(policy_key)
@@ -234,14 +256,14 @@ class Sac:
 
     def _collect(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         key, act_key, random_key = jax.random.split(state.key, 3)
-        observation = _observe(state.env)
-        inputs = controller_inputs(observation, self.config.frame)
+        observation = self._observe(state.env)
+        inputs = self._see(observation, _one_maze(state))
         logits = self.networks.policy_network.apply(state.normalizer, state.policy, inputs)
         action = self.networks.parametric_action_distribution.sample(logits, act_key)
         random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
-        after = jax.vmap(self.env.step)(state.env, action)
-        reward = self._reward(state.env, after)
+        after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
+        reward = self._reward(state.env, after, state.iteration)
         over = after.done
         truncation = after.info["truncation"]
         transition = Transition(
@@ -249,13 +271,13 @@ class Sac:
             action=action,
             reward=reward,
             discount=1.0 - over,
-            next_observation=_observe(after),
+            next_observation=self._observe(after),
             extras={"state_extras": {"truncation": truncation}},
         )
         state = state.replace(
             key=key,
             env=after,
-            normalizer=running_statistics.update(state.normalizer, inputs),
+            normalizer=self._watch(state.normalizer, inputs),
             replay=self._buffer.insert_internal(state.replay, transition),
         )
         count = lambda name: (over * after.info[name]).sum()  # noqa: E731
@@ -263,26 +285,32 @@ class Sac:
             "reward": reward.mean(), "episodes": over.sum(), "successes": count("success"), "falls": count("fall"),
         }  # fmt: skip
 
-    def _reward(self, before: State, after: State) -> jax.Array:
+    def _reward(self, before: State, after: State, iteration: jax.Array) -> jax.Array:
         """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus.
 
         A fall is paid like lying for ever, ``fall_m`` farther off: else it would end the losses of a robot far away.
         """
-        robot = self.env.robot
+        robot, config = self.env.robot, self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
         dense = {
             "velocity": (distance + after.reward) / robot.control_dt_s,
             "distance": after.reward,
-        }[robot.controller_reward]
+        }[self.reward]
         fallen = after.done * after.info["fall"]
-        for_ever = (after.reward - self.config.fall_m) / (1.0 - self.config.discount)
-        return jnp.where(fallen > 0, for_ever, dense) + self.config.arrival_bonus * after.done * after.info["success"]
+        farther = jnp.interp(
+            2.0 * iteration / self.config.iterations, jnp.array([0.0, 1.0]), jnp.asarray(config.fall_m)
+        )
+        if config.tilt_m:
+            up = own_frame(after.obs["proprio"])[1][..., 3]  # pyright: ignore
+            dense -= config.tilt_m * (1.0 - up)
+        for_ever = (after.reward - farther) / (1.0 - config.discount)
+        return jnp.where(fallen > 0, for_ever, dense) + config.arrival_bonus * after.done * after.info["success"]
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         state, losses = jax.lax.scan(lambda s, _: self._update(s), state, length=self.config.updates)
         return state, jax.tree.map(jnp.mean, losses)
 
-    def _present(self, batch: Transition, key: jax.Array) -> Transition:
+    def _present(self, batch: Transition, maze: Maze, key: jax.Array) -> Transition:
         """A batch from the replay as the networks see it."""
         now, action, after = batch.observation, batch.action, batch.next_observation
         if self._symmetries is not None:
@@ -291,13 +319,12 @@ class Sac:
             apply = lambda matrices, rows: jnp.einsum("bij,bj->bi", matrices, rows)  # noqa: E731
             whole = lambda o: jnp.concatenate([apply(proprio, o[:, :-2]), apply(world, o[:, -2:])], -1)  # noqa: E731
             now, action, after = whole(now), apply(joints, action), whole(after)
-        see = functools.partial(controller_inputs, frame=self.config.frame)
-        return batch._replace(observation=see(now), action=action, next_observation=see(after))
+        return batch._replace(observation=self._see(now, maze), action=action, next_observation=self._see(after, maze))
 
     def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         key, alpha_key, critic_key, actor_key, mirror_key = jax.random.split(state.key, 5)
         replay, batch = self._buffer.sample_internal(state.replay)
-        batch = self._present(batch, mirror_key)
+        batch = self._present(batch, _one_maze(state), mirror_key)
         alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
             state.log_alpha, state.policy, state.normalizer, batch, alpha_key, optimizer_state=state.alpha_optimizer
         )
@@ -318,6 +345,11 @@ class Sac:
         )  # fmt: skip
         losses = {"alpha_loss": alpha_loss, "critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
         return state, losses
+
+
+def _one_maze(state: SacState) -> Maze:
+    """The maze that all environments share."""
+    return jax.tree.map(lambda leaf: leaf[0], state.env.info["maze"])
 
 
 @struct.dataclass
@@ -374,6 +406,6 @@ def train_controller(
         lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
         checkpoints, chunk,
     )  # fmt: skip
-    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden, config.frame)
+    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden, config.frame, config.effort)
     test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
     return act, edge_success(test_env, act, maze, test_tasks, test_key)

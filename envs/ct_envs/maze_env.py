@@ -32,8 +32,8 @@ class MazeEnv(Env):
     """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-F).
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
-    velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25]. Action:
-    [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or action
+    velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
+    Action: [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or action
     that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``, ``collision``
     (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``, ``tasks`` and
     ``key``.

@@ -29,8 +29,11 @@ def local_map(
     *,
     cell_m: float,
     cells: int = MAP_CELLS,
-) -> Float[Array, "2 k k"]:
-    """The local map at ``position`` [m] with a goal at ``goal`` [m]; ``cell_m`` is the side of a map cell [m]."""
+) -> UInt8[Array, "2 k k"]:
+    """The local map at ``position`` [m] with a goal at ``goal`` [m]; ``cell_m`` is the side of a map cell [m].
+
+    In bytes: thousands of maps a step are a matter of memory bandwidth.
+    """
     offset = (jnp.arange(cells) - (cells - 1) / 2) * cell_m
     column, row = (jnp.floor((position[:, None] + offset[None]) / maze.cell_m)).astype(jnp.int32)
     height, width = maze.shape
@@ -39,7 +42,7 @@ def local_map(
     at = jnp.round((goal - position) / cell_m + (cells - 1) / 2).astype(jnp.int32)
     index = jnp.arange(cells)
     here = (index[:, None] == at[1]) & (index[None, :] == at[0])
-    return jnp.stack([walls, here]).astype(jnp.float32)
+    return jnp.stack([walls, here]).astype(jnp.uint8)
 
 
 def lidar_map(
