@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ct_envs import load_maze, make_maze, random_walls
-from ct_envs.occupancy import MAP_CELLS, local_map
+from ct_envs import UserError, load_maze, make_maze, random_walls
+from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, MAP_CELLS, lidar_map, local_map
 
 SEEDS = st.integers(0, 2**31 - 1)
 CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the second is our setting, the first the Turtlebot3's
@@ -117,3 +117,105 @@ def test_maps_are_small_arrays_of_zeros_and_ones():
     assert picture.dtype == np.uint8
     assert set(np.unique(picture)) == {0, 1}
     assert picture[0, 12, 12] == 0
+
+
+# ------------------------------------------------------------------------------------------------------- lidar
+
+
+def draw_ranges(seed: int) -> np.ndarray:
+    """Ranges of which half are within the metre, none of them ending near a cell's border."""
+    ranges = np.random.default_rng(seed).uniform(0.1, 1.9, LIDAR_BEAMS)
+    angle = np.radians(np.arange(LIDAR_BEAMS))
+    ticks = ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1) / LIDAR_CELL_M + 0.5
+    near = (np.abs(ticks - np.round(ticks)) < 1e-6).any(-1)
+    return np.where(near, 1.5, ranges)
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_a_lidar_marks_the_cells_its_beams_end_in_and_no_others(seed):
+    ranges = draw_ranges(seed)
+    angle = np.radians(np.arange(LIDAR_BEAMS))
+    expected = np.zeros((MAP_CELLS, MAP_CELLS), np.uint8)
+    ticks = (np.arange(MAP_CELLS) - 12) * LIDAR_CELL_M
+    for distance, a in zip(ranges, angle, strict=True):
+        if distance < 1.0:
+            x, y = distance * np.cos(a), distance * np.sin(a)
+            expected[np.abs(ticks - y).argmin(), np.abs(ticks - x).argmin()] = 1
+    np.testing.assert_array_equal(lidar_map(ranges, [3.0, 0.0])[0], expected)
+
+
+@given(SEEDS, st.integers(0, 3))
+@settings(max_examples=20)
+def test_the_lidar_map_turns_with_the_world(seed, quarters):
+    """Beams a quarter turn on, or a robot that has turned by one: the map is turned by one."""
+    ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
+    here = lidar_map(ranges, goal)
+    a = quarters * np.pi / 2
+    turned_goal = np.round([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ goal
+    turned = np.rot90(here, -quarters, axes=(1, 2))
+    np.testing.assert_array_equal(lidar_map(np.roll(ranges, 90 * quarters), turned_goal), turned)
+    np.testing.assert_array_equal(lidar_map(ranges, turned_goal, yaw_rad=a), turned)
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_left_and_right_of_a_lidar_are_mirrored(seed):
+    ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
+    mirrored = lidar_map(np.roll(ranges[::-1], 1), goal * [1, -1])
+    np.testing.assert_array_equal(mirrored, lidar_map(ranges, goal)[:, ::-1])
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_a_batch_of_lidars_is_one_after_the_other(seed):
+    ranges = np.stack([draw_ranges(seed + i) for i in range(6)]).reshape(2, 3, LIDAR_BEAMS)
+    rng = np.random.default_rng(seed)
+    goal, yaw = rng.uniform(-1.2, 1.2, (2, 3, 2)), rng.uniform(-3, 3, (2, 3))
+    together = lidar_map(ranges, goal, yaw_rad=yaw)
+    for i in np.ndindex(2, 3):
+        np.testing.assert_array_equal(together[i], lidar_map(ranges[i], goal[i], yaw_rad=yaw[i]))
+    assert together.dtype == np.uint8 and together.shape == (2, 3, 2, 25, 25)
+
+
+@given(SEEDS)
+@settings(max_examples=20)
+def test_both_maps_put_the_goal_into_the_same_cell(seed):
+    goal = np.random.default_rng(seed).uniform(-1.2, 1.2, 2)
+    halves = goal / LIDAR_CELL_M + 0.5
+    assume(np.abs(halves - np.round(halves)).min() > 1e-3)
+    far = np.float32([50.0, 50.0])  # of an empty room
+    maze = make_maze(random_walls(0, height=30, width=30, density=0.0))
+    drawn = draw(maze, far, far + np.float32(goal), np.float32(LIDAR_CELL_M))
+    np.testing.assert_array_equal(lidar_map(np.full(LIDAR_BEAMS, 3.5), goal), drawn)
+
+
+def with_beam(value: float) -> np.ndarray:
+    return np.where(np.arange(LIDAR_BEAMS) == 17, value, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        (with_beam(np.nan), "beam 17"),
+        (with_beam(np.inf), "beam 17"),
+        (with_beam(0.0), "beam 17"),
+        (with_beam(-0.3), "beam 17"),
+        (np.ones(359), "359 ranges, not 360"),
+        (np.ones(361), "361 ranges, not 360"),
+        ([], "0 ranges"),
+        (0.5, "no list of ranges"),
+    ],
+)
+def test_a_lidar_that_is_wrong_is_one_line(ranges, words):
+    with pytest.raises(UserError, match=words) as caught:
+        lidar_map(ranges, [1.0, 0.0])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_a_beam_without_an_answer_may_be_allowed(value):
+    nothing = lidar_map(with_beam(1.0), [1.0, 0.0])
+    np.testing.assert_array_equal(lidar_map(with_beam(value), [1.0, 0.0], missing_ok=True), nothing)
+    with pytest.raises(UserError):
+        lidar_map(with_beam(-0.1), [1.0, 0.0], missing_ok=True)

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 # Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
 ORDER = [
     *["interrupts", "checkpoint", "progress"],
-    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
+    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect", "collect_turtlebot3"],
     *["transformer", "value", "fit", "policy", "evaluate", "finetune"],
     *["baselines", "transfer", "presets", "model", "run"],
     *["report", "pipeline", "cli"],

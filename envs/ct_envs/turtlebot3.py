@@ -70,10 +70,10 @@ class Turtlebot3Config:
 
 
 class Pose(NamedTuple):
-    """Where the middle of the robot's axle is, in the world."""
+    """Where the middle of the robot's axle is, in the world. May have leading batch axes."""
 
-    position: np.ndarray  # float64 [2], [m]
-    yaw_rad: float
+    position: np.ndarray  # float64 [*b, 2], [m]
+    yaw_rad: Any  # float [*b]
 
 
 class Touch(NamedTuple):
@@ -117,20 +117,23 @@ def to_heading(vector: Float[np.ndarray, "*n 2"], yaw_rad: Any) -> Float[np.ndar
     return np.stack([cosine * x + sine * y, cosine * y - sine * x], -1)
 
 
-def observe(pose: Pose, goal: np.ndarray, ranges: np.ndarray, *, frame: str = "heading") -> dict[str, np.ndarray]:
-    """What a policy sees: ``map`` [2, 25, 25] of bytes, ``proprio`` [cos dpsi, sin dpsi], ``goal`` [2] (m).
+def observe(
+    pose: Pose, goal: Float[np.ndarray, "*b 2"], ranges: Float[np.ndarray, "*b 360"], *, frame: str = "heading",
+    missing_ok: bool = False,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """What a policy sees: ``map`` [*b, 2, 25, 25] of bytes, ``proprio`` [cos dpsi, sin dpsi] and ``goal`` [*b, 2] (m).
 
     Args:
-        pose: as the robot believes it to be.
+        pose: as the robot believes it to be; positions [*b, 2] (m), yaws [*b].
         goal: in the world [m].
-        ranges: of the lidar [360] (m); see ``lidar_map``.
+        ranges: of the lidar [m]; see ``lidar_map``, also for ``missing_ok``.
     """
-    ahead = to_heading(goal - pose.position, pose.yaw_rad)
-    distance = np.linalg.norm(ahead)
-    direction = ahead / distance if distance > 1e-9 else np.array([1.0, 0.0])
-    aligned = frame == "world"
-    vector = goal - pose.position if aligned else ahead
-    picture = lidar_map(ranges, vector, yaw_rad=pose.yaw_rad if aligned else 0.0)
+    away, yaw = goal - pose.position, np.asarray(pose.yaw_rad)
+    ahead = to_heading(away, yaw)
+    distance = np.linalg.norm(ahead, axis=-1, keepdims=True)
+    direction = np.where(distance > 1e-9, ahead / np.maximum(distance, 1e-9), [1.0, 0.0])
+    vector, turned = (away, yaw) if frame == "world" else (ahead, np.zeros_like(yaw))
+    picture = lidar_map(ranges, vector, yaw_rad=turned, missing_ok=missing_ok)
     return {"map": picture, "proprio": direction.astype(np.float32), "goal": vector.astype(np.float32)}
 
 

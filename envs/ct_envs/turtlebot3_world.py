@@ -93,8 +93,13 @@ class World:
         raise UserError(f"no start and goal {apart_m} m apart in one free region; use fewer or smaller obstacles")
 
     def reachable(self, start: np.ndarray, goal: np.ndarray, radius: float) -> bool:
-        """Whether a robot can go from start to goal [2] (m), as well as a grid of 5 cm can tell."""
-        start_label, goal_label = _regions(self, radius).of(np.asarray([start, goal], np.float64))
+        """Whether a robot may be able to go from start to goal [2] (m), where it can stand.
+
+        Told on a grid of 5 cm, in which gaps count as free that are up to 7 cm too narrow; what can be reached is.
+        """
+        start_label, goal_label = _regions(self, radius - REGION_CELL_M * 2**-0.5).of(
+            np.asarray([start, goal], np.float64)
+        )
         return bool(start_label == goal_label and start_label > 0)
 
     def covered(self) -> float:
