@@ -3,21 +3,23 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import State
 from scipy import stats
 
 from ct_envs import MazeEnv
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
-from ct_jax.policy import TransformerPolicy
+from ct_jax.policy import Conditioned
 from ct_jax.prm import PlanTable, PrmConfig, build_roadmap, extend
-from ct_jax.rollout import Controller, Guided, Steps
+from ct_jax.rollout import Controller, Guided, Policy, Steps
 
 METHODS = ("ct", "planner", "explorer")
+GUIDED = ("planner", "explorer")  # what is led by a plan; everything else is a policy that was learned
 RETURN_UNIT = 100.0  # the paper's scaled return is the raw one over this
 
 
@@ -94,13 +96,21 @@ def _join(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return np.stack([start, goal], 1).reshape(-1, 2)
 
 
+class Learned(Policy, Protocol):
+    """A policy that can begin an episode by itself: the transformer's, or a baseline's."""
+
+    def init(self, state: State) -> Any:
+        """Its memory at the start of N episodes."""
+        ...
+
+
 def evaluate(
     env: MazeEnv,
     maze: Maze,
     pairs: Pairs,
     method: str,
     *,
-    policy: TransformerPolicy | None = None,
+    policy: Learned | None = None,
     controller: Controller | None = None,
     prm: PrmConfig | None = None,
     on_progress: Callable[[int, int], None] | None = None,
@@ -109,7 +119,7 @@ def evaluate(
 
     Args:
         env: with maps, without auto-reset.
-        method: "ct" (needs ``policy``), "planner" (the full map, needs ``controller``) or "explorer" (likewise).
+        method: "planner" (the full map, needs ``controller``), "explorer" (likewise), or any name for ``policy``.
     """
     begun = time.perf_counter()
     n = len(pairs.start)
@@ -117,10 +127,10 @@ def evaluate(
     mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
     state = start_episodes(env, key, mazes, jnp.asarray(pairs.start), jnp.asarray(pairs.goal))
     asked = None
-    if method == "ct":
+    if method not in GUIDED:
         assert policy is not None
         actor, memory = policy, policy.init(state)
-        asked = np.asarray(memory.rtg)
+        asked = np.asarray(memory.rtg) if isinstance(memory, Conditioned) else None
     else:
         assert controller is not None
         prm = prm or PrmConfig()

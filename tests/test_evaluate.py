@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +16,7 @@ from ct_jax.collect import run_episodes
 from ct_jax.evaluate import Episodes, Pairs, bootstrap, draw_pairs, evaluate, wilson
 from ct_jax.pipeline import result_row
 from ct_jax.policy import TransformerPolicy
+from ct_jax.rollout import act_as_meant
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -205,3 +208,20 @@ def test_without_compilation(policy, monkeypatch):
         done = evaluate(env, maze, two, "ct", policy=policy)
     assert done.steps.tolist() == [1]
     assert done.returns[0] == pytest.approx(-0.7, abs=0.1)
+
+
+def test_any_policy_can_be_evaluated():
+    """Whatever begins an episode by itself and acts: here straight into the wall."""
+
+    @struct.dataclass
+    class East:
+        def init(self, state):
+            return jnp.zeros(state.done.shape[0])
+
+        def act(self, memory, state, key):
+            return act_as_meant(jnp.tile(jnp.array([[1.0, 0.0]]), (len(memory), 1))), memory + 1
+
+    two = Pairs(np.float32([[6, 6], [6, 6]]), np.float32([[12, 6], [6, 14]]), np.float32([6, 8]), 0)
+    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=40)
+    done = evaluate(env, load_maze("antmaze-umaze"), two, "east", policy=East())
+    assert done.success.tolist() == [True, False] and done.collided.tolist() == [False, True] and done.asked is None

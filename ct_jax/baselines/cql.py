@@ -1,0 +1,233 @@
+"""PT-CQL: conservative Q-learning on the planner-guided trajectories (paper, sec. IV-B; Kumar et al., 2020).
+
+The same trajectories, final goals and reward -||g|| as for the transformer, as single steps (s, a, r, s'). An episode
+is over at its goal and nowhere else. What the critics say of actions that the data do not hold is pushed down: CQL(H),
+with the soft maximum over all actions estimated from uniform ones and from the policy's, each weighted by its density.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from ct_envs import Robot
+from ct_envs.frames import symmetries
+from ct_envs.maze import Maze
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
+from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.fit import data_mesh
+from ct_jax.trajectories import Trajectories, Window, sample_windows
+
+
+@dataclass(frozen=True)
+class CqlConfig:
+    """Conservative Q-learning."""
+
+    updates: int = 20_000
+    batch: int = 256  # steps of trajectories
+    learning_rate: float = 3e-4  # of policy, critics and temperature
+    width: int = 128  # of all layers
+    discount: float = 0.99
+    reward_scale: float = 0.1  # of the reward [m] in the critics' units
+    alpha: float = 1.0  # weight of the conservative penalty against the squared error
+    samples: int = 10  # actions of each kind (uniform, the policy's now, the policy's next) behind the penalty
+    target_rate: float = 0.005  # share of the new critics in the target critics at each update
+    temperature: float = 1.0  # weight of the policy's entropy, at first; 0: no entropy term
+    entropy: float = -1.0  # entropy for each action [nats] towards which the temperature is adapted
+    soft_target: bool = False  # count the entropy in the targets, too
+    imitation: int = 0  # first updates in which the policy imitates the data, while the critics find their feet
+    mirror: bool = False  # turn and reflect steps by a random symmetry of the robot
+    frame: str = "world"  # with "heading" the body is felt, and moved, in the robot's own frame
+
+
+@struct.dataclass
+class Learned:
+    """What gradients change."""
+
+    actor: Any
+    critics: Any
+    log_temperature: jax.Array
+
+
+@struct.dataclass
+class CqlState:
+    """Everything that training needs to go on."""
+
+    params: Learned
+    target: Any  # the critics, following slowly
+    optimizer: Any
+    key: jax.Array
+    update: jax.Array
+
+
+@struct.dataclass
+class Transitions:
+    """Steps of trajectories, and what came after them."""
+
+    now: Seen
+    action: Float[Array, "B A"]
+    reward: Float[Array, "B"]  # [m]
+    after: Seen
+    arrived: Float[Array, "B"]  # 1 where the goal was reached: nothing comes after
+    known: Float[Array, "B"]  # 0 where the trajectory was cut short: nobody knows what came after
+
+
+def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
+    """Pieces of two steps as transitions. The second may lie beyond the end, and then means nothing.
+
+    The reward is minus the distance after the step, so it tells an arrival from a trajectory that was cut short.
+    """
+    see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal[:, i])  # noqa: E731
+    reward, last = window.reward[:, 0], 1.0 - window.valid[:, 1]
+    arrived = last * (reward > -goal_tolerance_m)
+    known = window.valid[:, 0] * (1.0 - last + arrived)
+    return Transitions(see(0), window.action[:, 0], reward, see(1), arrived, known)
+
+
+class Cql:
+    """The learner: ``create`` and ``train`` on states, both pure."""
+
+    def __init__(self, config: CqlConfig, map_cell_m: float, robot: Robot, action_size: int):
+        self.config, self.map_cell_m, self.robot, self.action_size = config, map_cell_m, robot, action_size
+        self.actor, self.critics = Actor(action_size, config.width, config.frame), Critics(config.width, config.frame)
+        self.distribution = tanh_gaussian(action_size)
+        self.optimizer = optax.adam(config.learning_rate)
+        self.mesh = data_mesh(config.batch)
+        self._symmetries = symmetries(robot) if config.mirror else None
+        self.train = jax.jit(self._train, static_argnames="updates")
+
+    def create(self, key: jax.Array, data: Trajectories) -> CqlState:
+        """The state before training on data of these sizes, replicated over the devices."""
+        actor_key, critic_key, key = jax.random.split(key, 3)
+        see = sample_seen(data.proprio.shape[-1])
+        actor = jax.jit(self.actor.init)(actor_key, see)
+        critics = jax.jit(self.critics.init)(critic_key, see, jnp.zeros((1, 1, self.action_size)))
+        params = Learned(actor, critics, jnp.log(jnp.asarray(self.config.temperature, jnp.float32)))
+        state = CqlState(params, critics, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
+        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self.mesh, PartitionSpec()))
+
+    def policy(self, state: CqlState) -> ActorPolicy:
+        """The policy learned so far."""
+        return ActorPolicy(state.params.actor, self.action_size, self.config.width, self.config.frame)
+
+    def _train(
+        self, state: CqlState, data: Trajectories, mazes: Maze, updates: int
+    ) -> tuple[CqlState, dict[str, jax.Array]]:
+        """Run some updates (static); returns means over them."""
+        state, info = jax.lax.scan(lambda s, _: self._update(s, data, mazes), state, length=updates)
+        return state, jax.tree.map(jnp.mean, info)
+
+    def _update(self, state: CqlState, data: Trajectories, mazes: Maze) -> tuple[CqlState, dict[str, jax.Array]]:
+        draw, noise = jax.random.split(jax.random.fold_in(state.key, state.update))
+        window = sample_windows(
+            draw, data, data.reward, mazes, batch=self.config.batch, steps=2, overhang=1, map_cell_m=self.map_cell_m,
+            symmetries=self._symmetries,
+        )  # fmt: skip
+        window = jax.lax.with_sharding_constraint(window, NamedSharding(self.mesh, PartitionSpec("data")))
+        batch = transitions(window, self.robot.goal_tolerance_m)
+        gradient, info = jax.grad(self._loss, has_aux=True)(state.params, state, batch, noise)
+        change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
+        params: Any = optax.apply_updates(state.params, change)
+        target = optax.incremental_update(params.critics, state.target, self.config.target_rate)
+        return CqlState(params, target, optimizer, state.key, state.update + 1), info
+
+    def _loss(
+        self, params: Learned, state: CqlState, batch: Transitions, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The three losses together; each one's gradient moves its own parameters only."""
+        critic_key, actor_key = jax.random.split(key)
+        mean = lambda values: jnp.sum(values * batch.known) / jnp.maximum(jnp.sum(batch.known), 1.0)  # noqa: E731
+        error, gap, q = self._critic_losses(params, state.target, batch, critic_key)
+        actor, entropy = self._actor_loss(params, state.update, batch, actor_key)
+        surplus = jax.lax.stop_gradient(entropy) - self.config.entropy * self.action_size
+        losses = {"error": mean(error), "gap": mean(gap), "actor_loss": mean(actor)}
+        loss = losses["error"] + self.config.alpha * losses["gap"] + losses["actor_loss"]
+        loss += jnp.exp(params.log_temperature) * mean(surplus)
+        return loss, losses | {"q": mean(q), "entropy": mean(entropy), "temperature": jnp.exp(params.log_temperature)}
+
+    def _critic_losses(
+        self, params: Learned, target: Any, batch: Transitions, key: jax.Array
+    ) -> tuple[Float[Array, "B"], Float[Array, "B"], Float[Array, "B"]]:
+        """Squared error against the target critics, the conservative penalty, and Q of the data, for each step."""
+        config = self.config
+        next_key, uniform_key, here_key, there_key = jax.random.split(key, 4)
+        here, there = (
+            jax.lax.stop_gradient(self.actor.apply(params.actor, where)) for where in (batch.now, batch.after)
+        )
+        action, log_density = self._draw(next_key, there, 1)
+        after = self.critics.apply(target, batch.after, action).min(-1)  # pyright: ignore
+        if config.soft_target:
+            after -= jnp.exp(params.log_temperature) * log_density
+        after = jnp.where(batch.arrived > 0, 0.0, after[:, 0])
+        aim = jax.lax.stop_gradient(config.reward_scale * batch.reward + config.discount * after)
+
+        shape = (len(aim), config.samples, self.action_size)
+        uniform = jax.random.uniform(uniform_key, shape, minval=-1.0, maxval=1.0)
+        flat = jnp.full(shape[:2], -self.action_size * jnp.log(2.0))
+        drawn_here, drawn_there = (self._draw(k, p, config.samples) for k, p in ((here_key, here), (there_key, there)))
+        actions, densities = zip((uniform, flat), drawn_here, drawn_there, strict=True)
+        actions = jnp.concatenate([batch.action[:, None], *actions], 1)
+        q: Any = self.critics.apply(params.critics, batch.now, actions)  # [B, 1 + 3 samples, 2]
+        error = ((q[:, 0] - aim[:, None]) ** 2).sum(-1)
+        weighted = q[:, 1:] - jnp.concatenate(densities, 1)[..., None]
+        soft_maximum = jax.nn.logsumexp(weighted, axis=1) - jnp.log(3.0 * config.samples)
+        return error, (soft_maximum - q[:, 0]).sum(-1), q[:, 0].min(-1)
+
+    def _actor_loss(
+        self, params: Learned, update: jax.Array, batch: Transitions, key: jax.Array
+    ) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
+        """The policy's loss and its entropy, for each step: high values, or at first the actions of the data."""
+        temperature, critics = jax.lax.stop_gradient((jnp.exp(params.log_temperature), params.critics))
+        logits: Any = self.actor.apply(params.actor, batch.now)
+        action, log_density = self._draw(key, logits, 1)
+        value = self.critics.apply(critics, batch.now, action).min(-1)[:, 0]  # pyright: ignore
+        if self.config.imitation:
+            # An action at the very bound lies at infinity before the tanh.
+            done = self.distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
+            value = jnp.where(update < self.config.imitation, self.distribution.log_prob(logits, done), value)
+        return temperature * log_density[:, 0] - value, -log_density[:, 0]
+
+    def _draw(
+        self, key: jax.Array, logits: Float[Array, "B 2A"], n: int
+    ) -> tuple[Float[Array, "B n A"], Float[Array, "B n"]]:
+        """Actions of the policy, and the logarithm of their density."""
+        logits = jnp.repeat(logits[:, None], n, 1)
+        raw = self.distribution.sample_no_postprocessing(logits, key)
+        return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
+
+
+def train_cql(
+    key: jax.Array,
+    learner: Cql,
+    data: Trajectories,
+    mazes: Maze,
+    *,
+    on_progress: Callable[[int, dict[str, float]], None] = lambda update, metrics: None,
+    checkpoints: Checkpoints | None = None,
+    chunk: int = 20,
+) -> ActorPolicy:
+    """Train to the configured number of updates.
+
+    Args:
+        data: rewards -||g|| to the final goal; what was cut short before its goal counts but for its last step.
+        mazes: stacked; ``data.maze`` points into it.
+        on_progress: told (updates done, metrics) after every ``chunk``.
+        checkpoints: where to go on from, and where to save now and then and when interrupted.
+    """
+    state = learner.create(key, data)
+    place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
+    data, mazes = place(data), place(mazes)
+    state = run_to(
+        learner.config.updates, state, lambda state, n: learner.train(state, data, mazes, n),
+        lambda state: int(state.update),
+        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        checkpoints, chunk,
+    )  # fmt: skip
+    return jax.device_get(learner.policy(state))

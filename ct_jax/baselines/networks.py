@@ -1,0 +1,108 @@
+"""Actor and critics of the baselines: they see what the transformer sees, with the same map encoder, and no past."""
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from brax.training.distribution import NormalTanhDistribution
+from flax import struct
+from jaxtyping import Array, Float, UInt8
+
+from ct_envs.frames import turn
+from ct_envs.occupancy import MAP_CELLS
+from ct_jax.rollout import Action, act_as_meant
+from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, body_features, goal_features
+
+DIRECTIONS = 16  # planar vectors that are handed to a body with a heading
+
+
+class Seen(NamedTuple):
+    """What a policy sees."""
+
+    map: UInt8[Array, "*b 2 k k"]
+    proprio: Float[Array, "*b P"]
+    goal: Float[Array, "*b 2"]  # from the robot [m]
+
+
+def sample_seen(proprio_size: int) -> Seen:
+    """One observation, from which parameters are initialised."""
+    return Seen(jnp.zeros((1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8), jnp.zeros((1, proprio_size)), jnp.zeros((1, 2)))
+
+
+def tanh_gaussian(action_size: int) -> NormalTanhDistribution:
+    """The distribution whose parameters an ``Actor`` gives; its samples are actions before the tanh."""
+    return NormalTanhDistribution(action_size)
+
+
+def _perceive(seen: Seen, width: int, frame: str) -> Float[Array, "*b F"]:
+    """A first hidden layer over everything seen; inside a module.
+
+    With ``frame="heading"`` as in the transformer: where to go in the world, turned into the robot's own frame.
+    """
+    distance = jnp.linalg.norm(seen.goal, axis=-1, keepdims=True) / GOAL_SCALE_M
+    place = [MapEncoder(width)(seen.map), goal_features(seen.goal), distance]
+    if frame == "world":
+        return nn.relu(nn.Dense(width)(jnp.concatenate([*place, seen.proprio], -1)))
+    heading, body = body_features(seen.proprio)
+    x = nn.relu(nn.Dense(width)(jnp.concatenate([*place, heading, body], -1)))
+    where = nn.Dense(2 * DIRECTIONS)(x)
+    where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], DIRECTIONS, 2))
+    return jnp.concatenate([x, where.reshape(*where.shape[:-2], -1), body], -1)
+
+
+class Actor(nn.Module):
+    """pi(a | s, g): the parameters of a ``tanh_gaussian``."""
+
+    action_size: int
+    width: int
+    frame: str = "world"
+
+    @nn.compact
+    def __call__(self, seen: Seen) -> Float[Array, "*b 2A"]:
+        x = _perceive(seen, self.width, self.frame)
+        for _ in range(2):
+            x = nn.relu(nn.Dense(self.width)(x))
+        return nn.Dense(2 * self.action_size)(x)
+
+
+class Critics(nn.Module):
+    """Two Q(s, a | g) over one map encoder, each of M actions in the same state."""
+
+    width: int
+    frame: str = "world"
+
+    @nn.compact
+    def __call__(self, seen: Seen, action: Float[Array, "*b M A"]) -> Float[Array, "*b M 2"]:
+        x = _perceive(seen, self.width, self.frame)[..., None, :]
+        values = []
+        for _ in range(2):
+            # A dense layer of both, written as a sum: the state's share is computed once for its M actions.
+            y = nn.relu(nn.Dense(self.width)(x) + nn.Dense(self.width, use_bias=False)(action))
+            y = nn.relu(nn.Dense(self.width)(y))
+            values.append(nn.Dense(1)(y))
+        return jnp.concatenate(values, -1)
+
+
+@struct.dataclass
+class ActorPolicy:
+    """What a baseline learned, without chance; it remembers nothing."""
+
+    params: Any
+    action_size: int = struct.field(pytree_node=False)
+    width: int = struct.field(pytree_node=False)
+    frame: str = struct.field(pytree_node=False, default="world")
+
+    def init(self, state: State) -> tuple[()]:
+        """The memory of N episodes: none."""
+        del state
+        return ()
+
+    def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
+        """The next actions in N environments with maps."""
+        del key
+        obs: dict = state.obs  # pyright: ignore
+        actor = Actor(self.action_size, self.width, self.frame)
+        logits: Any = actor.apply(self.params, Seen(obs["map"], obs["proprio"], obs["goal"]))
+        return act_as_meant(tanh_gaussian(self.action_size).mode(logits)), memory

@@ -1,0 +1,87 @@
+"""SAC alone: the controller's learner with the whole maze as its task, without planner or data (paper, sec. IV-B).
+
+It sees what the transformer sees, its starts and goals lie anywhere in the maze, its reward is minus the distance to
+the goal, and an episode lasts as long as the robot's. The replay keeps positions; the maps are recomputed from them,
+exactly, when a batch is drawn.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+from brax.training.agents.sac import networks as sac_networks
+from brax.training.networks import FeedForwardNetwork
+from jaxtyping import Array, Float
+
+from ct_envs import MazeEnv, UserError
+from ct_envs.maze import Maze
+from ct_envs.occupancy import local_map
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
+from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.controllers.sac import Sac, SacConfig
+
+
+class SacAlone(Sac):
+    """The learner: ``Sac``, which also sees the local map. ``hidden[0]`` is the width of its networks."""
+
+    kept = 4
+
+    def __init__(self, env: MazeEnv, config: SacConfig):
+        if config.mirror or config.chain:
+            raise UserError("SAC alone learns from its own steps and from fresh starts: set mirror and chain to False")
+        super().__init__(env, config)
+        self.reward = "distance"
+
+    def _make_networks(self) -> sac_networks.SACNetworks:
+        size, width, frame = self.env.action_size, self.config.hidden[0], self.config.frame
+        actor, critics = Actor(size, width, frame), Critics(width, frame)
+        see = sample_seen(self.env.proprio_size)
+        policy = FeedForwardNetwork(
+            init=lambda key: actor.init(key, see),
+            apply=lambda normalizer, params, seen: actor.apply(params, seen),
+        )
+        critic = FeedForwardNetwork(
+            init=lambda key: critics.init(key, see, jnp.zeros((1, 1, size))),
+            apply=lambda normalizer, params, seen, action: critics.apply(params, seen, action[:, None])[:, 0],  # pyright: ignore
+        )
+        return sac_networks.SACNetworks(policy, critic, tanh_gaussian(size))  # pyright: ignore[reportCallIssue]
+
+    def _observe(self, state: State) -> Float[Array, "N P+4"]:
+        return jnp.concatenate([super()._observe(state), state.info["position"]], -1)
+
+    def _see(self, observation: Float[Array, "N P+4"], maze: Maze) -> Seen:
+        proprio, goal, position = observation[:, :-4], observation[:, -4:-2], observation[:, -2:]
+        see = jax.vmap(lambda at, to: local_map(maze, at, to, cell_m=self.env.map_cell_m))
+        return Seen(see(position, position + goal), proprio, goal)
+
+    def _watch(self, normalizer: Any, inputs: Seen) -> Any:
+        return normalizer  # not asked for: these networks take their inputs as the transformer does
+
+
+def train_sac_alone(
+    key: jax.Array,
+    env_factory: Callable[..., MazeEnv],
+    maze: Maze,
+    config: SacConfig,
+    *,
+    on_progress: Callable[[int, dict[str, float]], None] = lambda iteration, metrics: None,
+    checkpoints: Checkpoints | None = None,
+    chunk: int = 25,
+) -> ActorPolicy:
+    """Learn to find goals anywhere in a maze; ``config.episode_steps`` and ``held_out`` mean nothing here.
+
+    Args:
+        env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
+        on_progress: told (iterations done, metrics) after every ``chunk`` iterations.
+        checkpoints: where to go on from, and where to save now and then and when interrupted.
+    """
+    env = env_factory(maps=False)
+    sac = SacAlone(env, config)
+    state = run_to(
+        config.iterations, sac.create(key, maze, None), sac.train, lambda state: int(state.iteration),
+        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        checkpoints, chunk,
+    )  # fmt: skip
+    return ActorPolicy(jax.device_get(state.policy), env.action_size, config.hidden[0], config.frame)
