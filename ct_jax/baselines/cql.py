@@ -3,6 +3,12 @@
 The same trajectories, final goals and reward -||g|| as for the transformer, as single steps (s, a, r, s'). An episode
 is over at its goal and nowhere else. What the critics say of actions that the data do not hold is pushed down: CQL(H),
 with the soft maximum over all actions estimated from uniform ones and from the policy's, each weighted by its density.
+
+Settings. Learning rate, batch, discount, number of sampled actions, importance weights, target rate, a temperature that
+adapts, and no entropy in the targets are the defaults of the implementation that the paper used (github.com/young-geng/
+cql); it takes ``alpha=5`` and rewards as they are, for tasks whose rewards are of order one. Ours are tens of metres a
+step, so ``reward_scale=0.1`` brings them there. The target entropy, -1 for each action, is SAC's own. ``alpha``,
+``reward_scale``, ``updates`` and ``imitation`` are reasoned, not tuned yet.
 """
 
 import functools
