@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ct_envs.errors import UserError
-from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_RANGE_M, lidar_map
+from ct_envs.lidar import LIDAR_BEAMS, LIDAR_RANGE_M, lidar_map
 from ct_envs.turtlebot3_world import World
 
 WHEEL_RADIUS_M = 0.033  # r
@@ -41,8 +41,8 @@ _TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
 _SETTLE = 12  # physics steps in which a robot that was put down comes to rest
 _FRONTAL = np.cos(np.pi / 4)  # a contact within 45 degrees of the way the robot drives is frontal
 _WHEELS = ("wheel_left_joint", "wheel_right_joint")
-# What may touch what: body and obstacles, wheels and floor.
-_FLOOR, _ROLLING, _BODY, _OBSTACLE = 1, 2, 4, 8
+# What may meet what: body and obstacles, wheels and floor, and rays (of group 1, that is PyBullet's) obstacles alone.
+_RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ class Turtlebot3Env:
         quat = p.getQuaternionFromEuler([0.0, 0.0, yaw])
         body = p.createMultiBody(0, shape, -1, [x, y, _HEIGHT_M / 2], quat, **client)
         p.changeDynamics(body, -1, lateralFriction=0.5, restitution=0.0, **client)
-        p.setCollisionFilterGroupMask(body, -1, _OBSTACLE, _BODY, **client)
+        p.setCollisionFilterGroupMask(body, -1, _OBSTACLE, _BODY | _RAY, **client)
 
     def _load_robot(self, start: np.ndarray, yaw_rad: float) -> None:
         p, client = self._bullet, {"physicsClientId": self._client}

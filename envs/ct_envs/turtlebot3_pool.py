@@ -12,7 +12,7 @@ import os
 import signal
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ct_envs.errors import UserError
-from ct_envs.occupancy import LIDAR_BEAMS, MAP_CELLS
+from ct_envs.lidar import LIDAR_BEAMS, MAP_CELLS
 from ct_envs.turtlebot3 import Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_world import World
 
@@ -194,10 +194,8 @@ class _Worker:
     connection: Connection
 
     def send(self, command: str, content: dict[int, Any]) -> None:
-        try:
+        with suppress(OSError):  # it died: whoever waits for its answer will see
             self.connection.send((command, content))
-        except OSError:
-            pass  # it died: whoever waits for its answer will see
 
     def end(self) -> None:
         self.connection.close()
