@@ -330,6 +330,7 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
     "SPL": lambda row: f"{row['spl']:.2f}",
     "return / 100": lambda row: f"{row['return_scaled']:.1f}",
     "collided %": lambda row: f"{100 * row['collision_rate']:.0f}",
+    "fell %": lambda row: f"{100 * row.get('fall_rate', 0.0):.0f}",
     "steps": lambda row: f"{row['steps_mean']:.0f}",
 }
 

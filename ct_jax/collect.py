@@ -17,6 +17,7 @@ from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
 
 GUIDES = ("roadmap", "shortcut", "explorer")
+STARTS = ("vertices", "maze")
 
 
 @dataclass(frozen=True)
@@ -128,8 +129,10 @@ def collect(
         on_progress: told (successes, episodes) so far.
 
     Raises:
-        UserError: too few successes within ``give_up * T`` episodes.
+        UserError: too few successes within ``give_up * T`` episodes, or names that mean nothing.
     """
+    if config.starts not in STARTS:
+        raise UserError(f"no starts named '{config.starts}'; starts: {', '.join(STARTS)}")
     policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
     kept: list[Trajectories] = []
     successes = episodes = 0

@@ -39,9 +39,10 @@ class Episodes:
 
     success: np.ndarray  # bool [n]
     collided: np.ndarray  # bool [n]: touched a wall at any step
+    fell: np.ndarray  # bool [n]
     timeout: np.ndarray  # bool [n]
     steps: np.ndarray  # [n]
-    returns: np.ndarray  # [n], raw
+    returns: np.ndarray  # [n], raw; after a fall the robot lies where it is until the horizon
     travelled_m: np.ndarray  # [n]
     path: np.ndarray  # float32 [T, n, 2]: positions, for pictures
     pairs: Pairs
@@ -57,6 +58,7 @@ class Episodes:
         rows |= {"return_scaled_ci95": [x / RETURN_UNIT for x in bootstrap(self.returns)]}
         rows |= {"spl": float(spl.mean()), "spl_ci95": bootstrap(spl)}
         rows |= {"collision_rate": float(self.collided.mean()), "collision_ci95": wilson(self.collided)}
+        rows |= {"fall_rate": float(self.fell.mean()), "fall_ci95": wilson(self.fell)}
         rows |= {"timeout_rate": float(self.timeout.mean()), "timeout_ci95": wilson(self.timeout)}
         return rows | {"steps_mean": float(self.steps.mean()), "wall_s": round(self.wall_s, 2)}
 
@@ -141,20 +143,25 @@ def evaluate(
         actor = Guided(controller, guide)
         memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
     state, _, steps = run_episodes(env, actor, state, memory, key, chunk=50, limit=env.horizon, on_progress=on_progress)
-    return _outcome(steps, np.asarray(state.info["success"]) > 0, pairs, time.perf_counter() - begun, asked)
+    return _outcome(env.horizon, state, steps, pairs, time.perf_counter() - begun, asked)
 
 
-def _outcome(steps: Steps, success: np.ndarray, pairs: Pairs, wall_s: float, asked: np.ndarray | None) -> Episodes:
+def _outcome(
+    horizon: int, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: np.ndarray | None
+) -> Episodes:
+    success, fell = (np.asarray(state.info[name]) > 0 for name in ("success", "fall"))
     alive = np.asarray(steps.alive)
     path = np.asarray(steps.position)
-    moved = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(0)
+    whole = np.concatenate([path, np.asarray(state.info["position"])[None]])
+    lying = fell * np.asarray(state.reward) * (horizon - alive.sum(0))
     return Episodes(
         success=success,
         collided=(np.asarray(steps.collision) * alive).sum(0) > 0,
-        timeout=~success,
+        fell=fell,
+        timeout=~success & ~fell,
         steps=alive.sum(0),
-        returns=(np.asarray(steps.reward) * alive).sum(0),
-        travelled_m=moved,
+        returns=(np.asarray(steps.reward) * alive).sum(0) + lying,
+        travelled_m=np.linalg.norm(np.diff(whole, axis=0), axis=-1).sum(0),
         path=path,
         pairs=pairs,
         wall_s=wall_s,

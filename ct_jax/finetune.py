@@ -109,8 +109,10 @@ def recover(
         With ``keep="separate"`` two trajectories for each recovery, otherwise one.
 
     Raises:
-        UserError: too few recoveries within ``give_up * T`` episodes.
+        UserError: too few recoveries within ``give_up * T`` episodes, or a ``keep`` that means nothing.
     """
+    if config.keep not in KEEP:
+        raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
     kept: list[Trajectories] = []

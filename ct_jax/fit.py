@@ -47,7 +47,7 @@ class ValueConfig:
     """The value network's training, and which trajectories it sees (paper, sec. III-C)."""
 
     fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
-    top: float = 1.0  # only the best share X of the trajectories, by return per metre of straight distance
+    top: float = 1.0  # only the best share X of the trajectories, by return over the straight distance squared
     collision_free: bool = False  # only trajectories without a collision
     width: int = 128
 
@@ -161,13 +161,17 @@ def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: 
     return jax.jit(model.init)(key, *(inputs[:3] if isinstance(model, ValueNetwork) else inputs))
 
 
-def best_trajectories(data: Trajectories, config: ValueConfig) -> Trajectories:
-    """The trajectories that the value network learns from: the top X %, collision-free on demand.
+def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m: float) -> Trajectories:
+    """The trajectories that the value network learns from: those that arrive (a failure's return says nothing of the
+    way), of them the top X %, and collision-free on demand.
 
     Raises:
-        UserError: none is without a collision.
+        UserError: none is left.
     """
-    keep = np.ones(data.n, bool)
+    last = np.maximum(np.asarray(data.length) - 1, 0)
+    keep = np.asarray(data.reward)[np.arange(data.n), last] > -goal_tolerance_m
+    if not keep.any():
+        raise UserError("no trajectory arrives at its goal; collect anew")
     if config.collision_free:
         inside = np.arange(data.collision.shape[1]) < np.asarray(data.length)[:, None]
         keep &= ~((np.asarray(data.collision) > 0) & inside).any(1)

@@ -183,7 +183,7 @@ def _fit_both(
     value_params = policy.value_params
     if number == 0 or last:
         learner = _learner(value, settings.value.fit, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
-        best = best_trajectories(data, settings.value)
+        best = best_trajectories(data, settings.value, run.spec.goal_tolerance_m)
         value_params = train_one("value", learner, init_params(keys[0], value, data), best, keys[1])
     config = settings.fit
     if number:

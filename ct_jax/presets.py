@@ -84,13 +84,18 @@ PRESETS = {"demo": DEMO, "cpu": CPU, "published": PUBLISHED, "paper": PAPER}
 
 _ANT_SAC = SacConfig(
     envs=128,
-    iterations=24_000,
+    iterations=16_000,
     updates=16,
     warmup=50,
-    arrival_bonus=50.0,
+    final_rate=0.1,
+    average=0.9998,
+    critic_norm=True,
+    arrival_bonus=100.0,
+    tilt_m=3.0,
+    effort=0.5,
     reward_scale=0.1,
     replay=1_000_000,
-    episode_steps=80,
+    episode_steps=100,
     reset_velocity_mps=0.1,
     frame="heading",
     mirror=True,
@@ -101,7 +106,7 @@ _ANT_SAC = SacConfig(
 def _for_ant(settings: Settings) -> Settings:
     """A controller that has to balance, slower walks, and for what lifts the method a head that knows the heading."""
     model = replace(settings.model, frame="heading") if settings.reprompt else settings.model
-    collect = replace(settings.collect, horizon=700)
+    collect = replace(settings.collect, horizon=700, noise=0.2 * settings.collect.noise)
     return replace(settings, sac=_ANT_SAC, collect=collect, model=model)
 
 

@@ -1,40 +1,167 @@
-"""What the experiments share: train variants of the method, and gather their rows into one results file."""
+"""What the experiments share: the method's variants and the baselines, on the same data and the same pairs."""
 
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ct_jax.checkpoint import read_json, write_json
+import jax
+import jax.numpy as jnp
+
+from ct_jax import pipeline
+from ct_jax import trajectories as storage
+from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
+from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
+from ct_jax.baselines.sac_alone import train_sac_alone
+from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
 from ct_jax.cli import prepare_jax, print_rows
-from ct_jax.pipeline import train
-from ct_jax.presets import Settings
-from ct_jax.run import Run, default_mazes, load_mazes
+from ct_jax.controllers.sac import SacConfig
+from ct_jax.evaluate import evaluate
+from ct_jax.finetune import RecoverConfig
+from ct_jax.presets import Settings, get_preset
+from ct_jax.progress import Bar, Metrics
+from ct_jax.run import Run, default_mazes, join_mazes, load_mazes, slug
 
 RESULTS = Path(__file__).parent / "results"
 
 
-def run_variants(
-    robot: str, variants: dict[str, Settings], *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto"
+@dataclass(frozen=True)
+class Baselines:
+    """The baselines' settings; they learn from the data of the first variant."""
+
+    cql: CqlConfig
+    sac: SacConfig
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an experiment runs."""
+
+    variants: dict[str, Settings]
+    baselines: Baselines | None = None
+
+
+def plan_for(robot: str, preset: str, *, controller: str) -> Plan:
+    """The rows of a robot's table. With "cpu": the method as published at the CPU's size, without returns (BC-CT),
+    fine-tuned (F-CT, Algorithm 4), the preset with what lifts it, and the baselines."""
+    lifted = replace(get_preset(preset, robot), controller=controller)
+    if preset != "cpu":
+        return Plan({preset: lifted})
+    published = replace(get_preset("published", robot), controller=controller)
+    variants = {
+        "published": published,
+        "bc": replace(published, model=replace(published.model, returns=False)),
+        "f-ct": replace(
+            published,
+            recover=RecoverConfig(recoveries=500, bumps=20),
+            rounds=1,
+            round_fit=replace(published.fit, updates=published.fit.updates // 2, warmup=20),
+        ),
+        preset: lifted,
+    }
+    frame = lifted.model.frame
+    cql = CqlConfig(updates=8000, mirror=True, frame=frame)
+    # Alone, the maze is the task: longer ways, so a longer view.
+    sac = replace(lifted.sac, discount=0.99, chain=False, mirror=False, iterations=lifted.sac.iterations // 2)
+    return Plan(variants, Baselines(cql, sac))
+
+
+def run_plan(
+    robot: str, plan: Plan, *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto"
 ) -> list[dict[str, Any]]:
-    """Train and evaluate each variant with each seed, continuing what is there; returns all rows."""
+    """Train and evaluate everything with each seed, continuing what is there; returns all rows.
+
+    The references, planner and explorer, are the same in every run and appear once.
+    """
     prepare_jax()
     seen, unseen = default_mazes(robot)
     rows = []
-    for name, settings in variants.items():
-        for seed in seeds:
+    for seed in seeds:
+        for place, (name, settings) in enumerate(plan.variants.items()):
             run = Run(
                 folder=out / f"{name}-{seed}", robot=robot, preset=preset, settings=settings,
                 mazes=load_mazes(seen), eval_mazes=load_mazes(unseen), seed=seed, engine=engine,
             )  # fmt: skip
             print(f"== {robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
-            train(run, resume=True)
-            config = read_json(run.folder / "config.json")
-            made = {key: config[key] for key in ("commit", "hardware", "created")}
-            wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
-            for row in read_json(run.folder / "evaluate" / "results.json")["rows"]:
-                head = {"variant": name, "model_seed": seed}
-                rows.append(head | row | {"run_wall_s": round(wall_s)} | made)
+            pipeline.train(run, resume=True)
+            found = pipeline.results(run.folder)
+            if place == 0 and plan.baselines is not None:
+                found += run_baselines(run, plan.baselines)
+            if place or seed != seeds[0]:
+                found = [row for row in found if row["method"] not in ("planner", "explorer")]
+            rows += [_label(run, name, row) for row in found]
     return rows
+
+
+def _label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
+    """A row with what made it."""
+    config = read_json(run.folder / "config.json")
+    made = {key: config[key] for key in ("commit", "hardware", "created")}
+    wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
+    return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | made
+
+
+# ------------------------------------------------------------------------------------------------------- baselines
+
+
+def run_baselines(run: Run, baselines: Baselines) -> list[dict[str, Any]]:
+    """Train the baselines on a finished run's trajectories and in its maze, and evaluate them on its pairs."""
+    sac = baselines.sac
+
+    def learn_cql(key: jax.Array, on_progress: Callable, checkpoints: Checkpoints) -> ActorPolicy:
+        data = storage.load(run.folder / "collect" / "trajectories.npz")
+        learner = Cql(baselines.cql, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
+        return train_cql(key, learner, data, run.stacked, on_progress=on_progress, checkpoints=checkpoints)
+
+    def learn_sac(key: jax.Array, on_progress: Callable, checkpoints: Checkpoints) -> ActorPolicy:
+        maze = next(iter(run.mazes.values()))
+        return train_sac_alone(key, run.env, maze, sac, on_progress=on_progress, checkpoints=checkpoints)
+
+    cql = baselines.cql
+    rows = _baseline(run, "pt-cql", learn_cql, cql.updates, cql.width, cql.frame)
+    return rows + _baseline(run, "sac", learn_sac, sac.iterations, sac.hidden[0], sac.frame)
+
+
+def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, frame: str) -> list[dict[str, Any]]:
+    """Rows of one baseline, learned unless its weights are there."""
+    folder = run.folder / "baselines" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    env = run.env(auto_reset=False)
+    actor = Actor(env.action_size, width, frame)
+    params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
+    policy = ActorPolicy(params, env.action_size, width, frame)
+    file = folder / "weights.safetensors"
+    if not file.is_file():
+        metrics = Metrics(folder)
+        with Bar(name, total) as bar:
+
+            def on_progress(done: int, values: dict[str, float]) -> None:
+                metrics.log(name, done, **values)
+                bar.update(done)
+
+            checkpoints = Checkpoints(folder / "checkpoints")
+            learned = learn(jax.random.fold_in(run.key("fit"), total), on_progress, checkpoints)
+            checkpoints.close()
+        metrics.close()
+        save_weights(file, learned.params)
+    policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
+    rows = []
+    for maze_name, maze in join_mazes(run.mazes, run.eval_mazes).items():
+        kept = folder / f"{slug(maze_name)}.json"
+        if not kept.is_file():
+            pairs = pipeline.stored_pairs(
+                run.folder / "evaluate", run.spec, maze_name, maze, run.settings.episodes, run.settings.pairs_seed
+            )
+            episodes = evaluate(env, maze, pairs, name, policy=policy)
+            pipeline.save_episodes(kept.with_suffix(".npz"), episodes)
+            row = pipeline.result_row(run.robot, name, maze_name, episodes)
+            write_json(kept, row | {"seen": maze_name in run.mazes})
+        rows.append(read_json(kept))
+    return rows
+
+
+# --------------------------------------------------------------------------------------------------------- results
 
 
 def write_results(file: Path, command: str, rows: list[dict[str, Any]]) -> None:

@@ -140,6 +140,11 @@ def test_an_unknown_guide_lists_the_known():
         make_guide("oracle", ENV, PRM)
 
 
+def test_unknown_starts_list_the_known(push):
+    with pytest.raises(UserError, match="no starts named 'corners'; starts: vertices, maze"):
+        collect(jax.random.key(0), ENV, MAZES, push(), CollectConfig(starts="corners"), PRM)
+
+
 def test_what_came_after_the_end_counts_for_nothing():
     """In the record, episodes go on being there after their end; in trajectories, only their padding does."""
     alive = np.array([[1, 1], [1, 1], [1, 0], [0, 0]], np.float32)

@@ -10,7 +10,7 @@ from flax import struct
 
 from ct_envs import POINT, MazeEnv, UserError, load_maze, stack_mazes
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
-from ct_jax.finetune import RecoverConfig, Supervised, recover
+from ct_jax.finetune import RecoverConfig, Supervised, Watching, lie_for_ever, recover
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Guided, act_as_meant
@@ -187,3 +187,25 @@ def test_without_compilation(push):
     _, after = jax.jit(Supervised.act)(supervised, after, batch.state, jax.random.key(2))
     assert after.rescued.all()
     assert jnp.isfinite(action.target).all()
+
+
+def test_an_unknown_way_to_keep_lists_the_known(push):
+    with pytest.raises(UserError, match="'framed'; ways: separate, joined, relabelled"):
+        recoveries(Blind(push()), push, keep="framed")
+
+
+def test_a_fall_is_paid_until_the_horizon(toy_data):
+    """So that the return of a robot that soon fell is as bad as that of one that stood there for as long."""
+    data = toy_data([5, 5], steps=8)
+    paid = lie_for_ever(data, np.array([True, False]), horizon=20)
+    expected = np.asarray(data.rtg)[0, 0] + 15 * np.asarray(data.reward)[0, 4]
+    np.testing.assert_allclose(np.asarray(paid.rtg)[:, 0], [expected, np.asarray(data.rtg)[1, 0]], rtol=1e-5)
+
+
+def test_touching_walls_time_and_again_is_a_failure(push):
+    guide = make_guide("explorer", ENV, PRM)
+    supervised = Supervised(Blind(push()), Guided(push(), guide), replace(CONFIG, bumps=2, stuck_m=0.0, patience=99))
+    touched = jnp.zeros((CONFIG.stuck_steps, 3)).at[-2:, 1].set(1.0).at[0, 2].set(1.0)
+    past = jnp.full((CONFIG.stuck_steps, 3, 2), jnp.inf)
+    memory = Watching(None, None, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(3, bool))
+    np.testing.assert_array_equal(supervised._failed(memory, jnp.zeros((3, 2))), [False, True, False])

@@ -161,7 +161,7 @@ def score(data):
 @pytest.mark.parametrize("top", [1.0, 0.5, 0.1])
 def test_the_value_network_sees_the_best(toy_data, top):
     data = toy_data(list(range(5, 25)))
-    best = best_trajectories(data, ValueConfig(top=top))
+    best = best_trajectories(data, ValueConfig(top=top), np.inf)
     assert best.n == max(1, round(top * data.n))
     chosen = np.isin(data.length, best.length)
     assert score(data)[chosen].min() >= score(data)[~chosen].max(initial=-np.inf)
@@ -173,16 +173,26 @@ def test_the_value_network_sees_no_collision(toy_data):
     collision[0, 0] = collision[1, 4] = 1.0
     collision[2, 5] = 1.0  # after its end: none of it
     data = data.replace(collision=collision, proprio=data.proprio)
-    best = best_trajectories(data, ValueConfig(collision_free=True))
+    best = best_trajectories(data, ValueConfig(collision_free=True), np.inf)
     np.testing.assert_array_equal(best.proprio[:, 0, 0], [2, 3, 4, 5])
-    both = best_trajectories(data, ValueConfig(collision_free=True, top=0.5))
+    both = best_trajectories(data, ValueConfig(collision_free=True, top=0.5), np.inf)
     assert both.n == 2 and set(both.proprio[:, 0, 0]) < {2, 3, 4, 5}
+
+
+def test_the_value_network_sees_arrivals_only(toy_data):
+    data = toy_data([4, 5, 6], steps=8)
+    reward = np.array(data.reward) - 1.0
+    reward[1, 4] = reward[2, 6] = -0.3  # the last step of the second; the third was cut short a step before
+    best = best_trajectories(data.replace(reward=reward), ValueConfig(), 0.5)
+    np.testing.assert_array_equal(best.length, [5])
+    with pytest.raises(UserError, match="no trajectory arrives"):
+        best_trajectories(data.replace(reward=reward - 1.0), ValueConfig(), 0.5)
 
 
 def test_no_trajectory_without_a_collision_is_an_error(toy_data):
     data = toy_data([5, 5])
     with pytest.raises(UserError, match="collision"):
-        best_trajectories(data.replace(collision=1 + 0 * data.collision), ValueConfig(collision_free=True))
+        best_trajectories(data.replace(collision=1 + 0 * data.collision), ValueConfig(collision_free=True), np.inf)
 
 
 # ----------------------------------------------------------------------------------------------------------- devices

@@ -7,10 +7,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training.acme import running_statistics, specs
+from brax.training.types import Transition
 
-from ct_envs import POINT, MazeEnv, Tasks, UserError, load_maze
+from ct_envs import ANT, POINT, MazeEnv, Tasks, UserError, load_maze
+from ct_envs.frames import symmetries
 from ct_jax.checkpoint import Checkpoints
-from ct_jax.controllers.sac import Sac, SacConfig, SacController, edge_success, split_edges, train_controller
+from ct_jax.controllers.sac import (
+    Sac,
+    SacConfig,
+    SacController,
+    chain_tasks,
+    controller_networks,
+    edge_success,
+    input_size,
+    split_edges,
+    train_controller,
+)
 from ct_jax.prm import PrmConfig, build_roadmap
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
@@ -53,6 +66,15 @@ def same(a, b) -> bool:
 
 
 # ----------------------------------------------------------------------------------------------------------- edges
+
+
+def test_chained_tasks_begin_where_the_one_before_ends(roadmap):
+    tasks = chain_tasks(split_edges(roadmap, 0.2, 0)[0], seed=1)
+    follow = np.asarray(tasks.follow)
+    np.testing.assert_array_equal(
+        np.asarray(tasks.start)[follow], np.broadcast_to(np.asarray(tasks.goal)[:, None], (*follow.shape, 2))
+    )
+    assert len(np.unique(follow)) > len(follow) / 2  # not always the way back
 
 
 def ends(tasks: Tasks) -> list[tuple]:
@@ -215,3 +237,52 @@ def test_it_learns_to_walk(roadmap):
     config = SacConfig(iterations=400, warmup=10, hidden=(64, 64), episode_steps=40)
     _, success = train_controller(jax.random.key(0), ENV, UMAZE, roadmap, config)
     assert success > 0.9
+
+
+# ------------------------------------------------------------------------------------------------------- the ant
+
+
+def test_a_heading_is_asked_of_a_robot_that_has_one():
+    with pytest.raises(UserError, match="'point' has no heading"):
+        make(replace(TINY, frame="heading"))
+    with pytest.raises(UserError, match="no frame named 'body'; frames: world, heading"):
+        make(replace(TINY, frame="body"))
+
+
+def test_the_ants_controller_does_not_see_the_world_turn():
+    controller, group = blank_controller(ANT, "heading"), symmetries(ANT)
+    proprio = MazeEnv(ANT, engine="mujoco", maps=False, maze=UMAZE).reset(jax.random.key(0)).obs["proprio"]
+    goal = jnp.array([3.0, 1.0])
+    turned = (np.linalg.det(group.world) > 0) & (group.action == np.eye(8)).all((1, 2))
+    turns = np.flatnonzero(turned)
+    assert len(turns) == 4
+    actions = controller(group.proprio[turns] @ proprio, group.world[turns] @ goal)
+    np.testing.assert_allclose(actions, np.broadcast_to(actions[:1], actions.shape), atol=1e-5)
+    assert not np.allclose(actions, controller(jnp.tile(proprio, (4, 1)), group.world[turns] @ goal), atol=1e-2)
+
+
+def test_a_fall_costs_more_and_more():
+    config = replace(TINY, iterations=10, fall_m=(5.0, 60.0), fall_ramp=(0.2, 0.8), discount=0.9)
+    sac = make(config)
+    batch = Transition(
+        observation=jnp.zeros((2, 4)), action=jnp.zeros((2, 2)), reward=jnp.array([-3.0, -3.0]),
+        discount=jnp.array([0.0, 1.0]), next_observation=jnp.zeros((2, 4)),
+        extras={"state_extras": {"truncation": jnp.zeros(2), "fall": jnp.array([1.0, 0.0])}},
+    )  # fmt: skip
+    for iteration, cost in ((0, 80.0), (5, 355.0), (9, 630.0)):
+        np.testing.assert_allclose(sac._pay_falls(batch, jnp.array(iteration)).reward, [-cost, -3.0], rtol=1e-5)
+
+
+def test_effort_limits_what_the_controller_asks_for():
+    full, gentle = (blank_controller(POINT, "world", effort=effort) for effort in (1.0, 0.25))
+    proprio, goal = jnp.ones((5, 2)), 10 * jnp.ones((5, 2))
+    np.testing.assert_allclose(0.25 * full(proprio, goal), gentle(proprio, goal), rtol=1e-6)
+
+
+def blank_controller(robot, frame: str, effort: float = 1.0) -> SacController:
+    """An untrained controller."""
+    env = MazeEnv(robot, engine="mujoco", maps=False)
+    size = input_size(env.proprio_size, frame)
+    policy = controller_networks(size, env.action_size, (16,)).policy_network.init(jax.random.key(3))
+    normalizer = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
+    return SacController(normalizer, policy, env.action_size, (16,), frame, effort)

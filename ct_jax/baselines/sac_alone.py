@@ -84,4 +84,4 @@ def train_sac_alone(
         lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
         checkpoints, chunk,
     )  # fmt: skip
-    return ActorPolicy(jax.device_get(state.policy), env.action_size, config.hidden[0], config.frame)
+    return ActorPolicy(jax.device_get(state.average), env.action_size, config.hidden[0], config.frame)

@@ -41,12 +41,16 @@ class SacConfig:
     warmup: int = 20  # first iterations, with random actions and no updates
     batch: int = 256  # paper
     learning_rate: float = 3e-4  # paper
+    final_rate: float = 1.0  # share of the learning rate that is left at the end; it falls linearly
+    average: float = 0.0  # decay, an update, of the mean of past policies that the controller is; 0: the last one
+    critic_norm: bool = False  # layer norm in the critics
     hidden: tuple[int, ...] = (256, 256)  # paper, for point and ant
     discount: float = 0.97
     initial_temperature: float = 0.1
     arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
-    fall_m: tuple[float, float] = (5.0, 40.0)  # a fall costs what lying for ever this much farther off would [m]: at
-    # first, while each attempt to walk ends in one, and from halfway through the training on
+    fall_m: tuple[float, float] = (5.0, 60.0)  # a fall costs what lying for ever this much farther off would [m]: at
+    # first, while each attempt to walk ends in one, and later, when one in a thousand steps is too many
+    fall_ramp: tuple[float, float] = (0.2, 0.8)  # from where to where in the training it grows
     tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
     effort: float = 1.0  # share of the actuators' range that the controller uses
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
@@ -65,6 +69,7 @@ class SacState:
     """Everything that training needs to go on."""
 
     policy: Any
+    average: Any  # of the policies so far
     critic: Any
     target_critic: Any
     log_alpha: jax.Array
@@ -96,13 +101,16 @@ def input_size(proprio_size: int, frame: str) -> int:
     return jax.eval_shape(functools.partial(controller_inputs, frame=frame), whole).shape[0]
 
 
-def controller_networks(observation_size: int, action_size: int, hidden: tuple[int, ...]) -> sac_networks.SACNetworks:
+def controller_networks(
+    observation_size: int, action_size: int, hidden: tuple[int, ...], *, critic_norm: bool = False
+) -> sac_networks.SACNetworks:
     """Policy and critics for a controller of these sizes."""
     return sac_networks.make_sac_networks(
         observation_size,
         action_size,
         preprocess_observations_fn=running_statistics.normalize,
         hidden_layer_sizes=hidden,
+        q_network_layer_norm=critic_norm,
     )
 
 
@@ -177,7 +185,9 @@ class Sac:
         self._input_size = input_size(env.proprio_size, config.frame)
         self.networks = self._make_networks()
         self.reward = env.robot.controller_reward
-        self._optimizer = optax.adam(config.learning_rate)
+        updates = config.iterations * config.updates
+        rate = optax.linear_schedule(config.learning_rate, config.final_rate * config.learning_rate, updates)
+        self._optimizer = optax.adam(rate if config.final_rate < 1.0 else config.learning_rate)
         alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
             self.networks, reward_scaling=config.reward_scale, discounting=config.discount, action_size=env.action_size
         )
@@ -192,13 +202,16 @@ class Sac:
             reward=jnp.zeros(()),
             discount=jnp.zeros(()),
             next_observation=jnp.zeros(size),
-            extras={"state_extras": {"truncation": jnp.zeros(())}},
+            extras={"state_extras": {"truncation": jnp.zeros(()), "fall": jnp.zeros(())}},
         )
         self._buffer = replay_buffers.UniformSamplingQueue(config.replay, example, config.batch)
         self.train = jax.jit(self._train, static_argnames="iterations")
 
     def _make_networks(self) -> sac_networks.SACNetworks:
-        return controller_networks(self._input_size, self.env.action_size, self.config.hidden)
+        config = self.config
+        return controller_networks(
+            self._input_size, self.env.action_size, config.hidden, critic_norm=config.critic_norm
+        )
 
     def _observe(self, state: State) -> Float[Array, "N P+kept"]:
         """What the replay keeps of a state."""
@@ -222,6 +235,7 @@ class Sac:
         resets = jax.vmap(self.env.reset, in_axes=(0, None, None))
         return SacState(
             policy=policy,
+            average=policy,
             critic=critic,
             target_critic=critic,
             log_alpha=log_alpha,
@@ -263,7 +277,7 @@ class Sac:
         random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
         after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
-        reward = self._reward(state.env, after, state.iteration)
+        reward = self._reward(state.env, after)
         over = after.done
         truncation = after.info["truncation"]
         transition = Transition(
@@ -272,7 +286,7 @@ class Sac:
             reward=reward,
             discount=1.0 - over,
             next_observation=self._observe(after),
-            extras={"state_extras": {"truncation": truncation}},
+            extras={"state_extras": {"truncation": truncation, "fall": over * after.info["fall"]}},
         )
         state = state.replace(
             key=key,
@@ -285,10 +299,10 @@ class Sac:
             "reward": reward.mean(), "episodes": over.sum(), "successes": count("success"), "falls": count("fall"),
         }  # fmt: skip
 
-    def _reward(self, before: State, after: State, iteration: jax.Array) -> jax.Array:
+    def _reward(self, before: State, after: State) -> jax.Array:
         """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus.
 
-        A fall is paid like lying for ever, ``fall_m`` farther off: else it would end the losses of a robot far away.
+        Of a fall it is minus the distance, whatever the robot's reward: see ``_pay_falls``.
         """
         robot, config = self.env.robot, self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
@@ -296,15 +310,22 @@ class Sac:
             "velocity": (distance + after.reward) / robot.control_dt_s,
             "distance": after.reward,
         }[self.reward]
-        fallen = after.done * after.info["fall"]
-        farther = jnp.interp(
-            2.0 * iteration / self.config.iterations, jnp.array([0.0, 1.0]), jnp.asarray(config.fall_m)
-        )
         if config.tilt_m:
             up = own_frame(after.obs["proprio"])[1][..., 3]  # pyright: ignore
             dense -= config.tilt_m * (1.0 - up)
-        for_ever = (after.reward - farther) / (1.0 - config.discount)
-        return jnp.where(fallen > 0, for_ever, dense) + config.arrival_bonus * after.done * after.info["success"]
+        dense += config.arrival_bonus * after.done * after.info["success"]
+        return jnp.where(after.done * after.info["fall"] > 0, after.reward, dense)
+
+    def _pay_falls(self, batch: Transition, iteration: jax.Array) -> Transition:
+        """The batch with falls paid like lying for ever, ``fall_m`` farther off, as they cost by now.
+
+        Without it a fall would end the losses of a robot far away.
+        """
+        config, fall = self.config, batch.extras["state_extras"]["fall"]
+        share = iteration / config.iterations
+        farther = jnp.interp(share, jnp.asarray(config.fall_ramp), jnp.asarray(config.fall_m))
+        for_ever = (batch.reward - farther) / (1.0 - config.discount)
+        return batch._replace(reward=jnp.where(fall > 0, for_ever, batch.reward))
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         state, losses = jax.lax.scan(lambda s, _: self._update(s), state, length=self.config.updates)
@@ -324,7 +345,7 @@ class Sac:
     def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         key, alpha_key, critic_key, actor_key, mirror_key = jax.random.split(state.key, 5)
         replay, batch = self._buffer.sample_internal(state.replay)
-        batch = self._present(batch, _one_maze(state), mirror_key)
+        batch = self._pay_falls(self._present(batch, _one_maze(state), mirror_key), state.iteration)
         alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
             state.log_alpha, state.policy, state.normalizer, batch, alpha_key, optimizer_state=state.alpha_optimizer
         )
@@ -337,9 +358,10 @@ class Sac:
             state.policy, state.normalizer, state.critic, alpha, batch, actor_key,
             optimizer_state=state.policy_optimizer,
         )  # fmt: skip
+        average = optax.incremental_update(policy, state.average, 1.0 - self.config.average)
         target = optax.incremental_update(critic, state.target_critic, self.config.target_rate)
         state = state.replace(
-            policy=policy, critic=critic, target_critic=target, log_alpha=log_alpha,
+            policy=policy, average=average, critic=critic, target_critic=target, log_alpha=log_alpha,
             policy_optimizer=policy_optimizer, critic_optimizer=critic_optimizer, alpha_optimizer=alpha_optimizer,
             replay=replay, key=key,
         )  # fmt: skip
@@ -406,6 +428,6 @@ def train_controller(
         lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
         checkpoints, chunk,
     )  # fmt: skip
-    act = SacController(state.normalizer, state.policy, env.action_size, config.hidden, config.frame, config.effort)
+    act = SacController(state.normalizer, state.average, env.action_size, config.hidden, config.frame, config.effort)
     test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
     return act, edge_success(test_env, act, maze, test_tasks, test_key)

@@ -31,6 +31,7 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
     ("SPL", "spl", "spl_ci95", words.decimal),
     ("Scaled return", "return_scaled", "return_scaled_ci95", lambda x: words.decimal(x, 1)),
     ("Collisions", "collision_rate", "collision_ci95", words.percent),
+    ("Falls", "fall_rate", "fall_ci95", words.percent),
     ("Time-outs", "timeout_rate", "timeout_ci95", words.percent),
     ("Mean steps", "steps_mean", "steps_ci95", lambda x: words.decimal(x, 0)),
 )
@@ -39,6 +40,7 @@ _GLOSSARY = {
     "SPL": "success weighted by path length: 1 is the shortest way, always",
     "Scaled return": "minus the distance to the goal, summed over all steps, over 100; nearer to 0 is better",
     "Collisions": "share of episodes in which the robot touched a wall at least once",
+    "Falls": "share of episodes that ended with the robot on its side or back",
     "Time-outs": "share of episodes that did not reach the goal in time",
 }
 CURVES = {  # what is drawn of a stage: the scalar, what it is, and how it is drawn
