@@ -104,10 +104,16 @@ _ANT_SAC = SacConfig(
 
 
 def _for_ant(settings: Settings) -> Settings:
-    """A controller that has to balance, slower walks, and for what lifts the method a head that knows the heading."""
-    model = replace(settings.model, frame="heading") if settings.reprompt else settings.model
+    """A controller that has to balance, slower walks, and for what lifts the method a head that knows the heading and a
+    longer memory: the ant is half as fast as the point."""
     collect = replace(settings.collect, horizon=700, noise=0.2 * settings.collect.noise)
-    return replace(settings, sac=_ANT_SAC, collect=collect, model=model)
+    settings = replace(settings, sac=_ANT_SAC, collect=collect)
+    if not settings.reprompt:
+        return settings
+    model = replace(settings.model, frame="heading", context=64, context_acting=64)
+    fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
+    longer = {name: replace(fit, steps=96) for name, fit in fits.items() if fit is not None}
+    return replace(settings, model=model, rounds=min(settings.rounds, 6), **longer)
 
 
 _ADAPTED = {"point": lambda settings: settings, "ant": _for_ant}

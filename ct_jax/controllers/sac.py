@@ -48,9 +48,9 @@ class SacConfig:
     discount: float = 0.97
     initial_temperature: float = 0.1
     arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
-    fall_m: tuple[float, float] = (5.0, 60.0)  # a fall costs what lying for ever this much farther off would [m]: at
-    # first, while each attempt to walk ends in one, and later, when one in a thousand steps is too many
-    fall_ramp: tuple[float, float] = (0.2, 0.8)  # from where to where in the training it grows
+    fall_m: tuple[float, float] = (5.0, 20.0)  # a fall costs what lying for ever this much farther off would [m]: at
+    # first, while each attempt to walk ends in one, and later; with 60 m the ant rather stood still
+    fall_ramp: tuple[float, float] = (0.2, 0.5)  # from where to where in the training it grows
     tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
     effort: float = 1.0  # share of the actuators' range that the controller uses
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
