@@ -102,8 +102,13 @@ def save_controller(folder: Path, robot: str, config: SacConfig, controller: Sac
     write_json(folder / "controller.json", _sizes(robot) | {"format": 1, "sac": asdict(config), "made": made})
 
 
-def load_controller(where: str, robot: str) -> tuple[SacController, SacConfig]:
+def load_controller(
+    where: str, robot: str, *, mend: str = "give another, or learn your 'own'"
+) -> tuple[SacController, SacConfig]:
     """Read the controller of a robot from a run folder, a controller's folder, or with "zoo" the shipped one.
+
+    Args:
+        mend: what the error tells a person to do about a damaged file.
 
     Raises:
         UserError: there is none, it is damaged, or it is another robot's (both are described).
@@ -115,7 +120,6 @@ def load_controller(where: str, robot: str) -> tuple[SacController, SacConfig]:
     if folder is None or not (folder / "controller.json").is_file():
         raise UserError(f"no controller of robot '{robot}' in '{where}'; give a run folder, 'zoo', or learn your 'own'")
     file = folder / "controller.json"
-    mend = "give another, or learn your 'own'"
     found = read_json(file, mend=mend)
     sizes = {name: found.get(name) for name in _sizes(robot)}
     if sizes != _sizes(robot):

@@ -97,7 +97,7 @@ def _controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
     if run.settings.controller != "own":
         return load_controller(run.settings.controller, run.robot)
     if run.done("controller") is not None:
-        return load_controller(str(run.folder), run.robot)
+        return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))
     roadmap = _prm(run)
     with run.stage("controller") as (folder, info), Bar("controller", config.iterations) as bar:
         checkpoints = Checkpoints(folder / "checkpoints")

@@ -103,7 +103,8 @@ def episodes(n=4, **changes) -> Episodes:
     pairs = Pairs(np.zeros((n, 2)), np.zeros((n, 2)), np.full(n, 10.0), 3)
     ones = np.ones(n)
     values = {
-        "success": ones > 0, "collided": ones < 0, "fell": ones < 0, "timeout": ones < 0, "steps": 20 * ones, "returns": -100 * ones,
+        "success": ones > 0, "collided": ones < 0, "fell": ones < 0, "timeout": ones < 0,
+        "steps": 20 * ones, "returns": -100 * ones,
         "travelled_m": 10 * ones, "path": np.zeros((5, n, 2), np.float32), "pairs": pairs, "wall_s": 1.0,
     }  # fmt: skip
     return Episodes(**values | changes)

@@ -11,7 +11,16 @@ import pytest
 from ct_envs import UserError
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.fit import ValueConfig
-from ct_jax.model import TrainedModel, blank_model, load_model, model_folder, save_model, zoo_names
+from ct_jax.model import (
+    TrainedModel,
+    blank_model,
+    load_controller,
+    load_model,
+    model_folder,
+    save_controller,
+    save_model,
+    zoo_names,
+)
 from ct_jax.presets import Settings
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache
 
@@ -149,3 +158,50 @@ def test_without_compilation(model, tmp_path):
         found = load_model(str(tmp_path))
         np.testing.assert_allclose(found.controller(proprio, goal), model.controller(proprio, goal), atol=1e-6)
     assert isinstance(found.policy.model, ControlTransformer)
+
+
+# ---------------------------------------------------------------------------------------------------- controllers
+
+
+@pytest.fixture
+def controller_folder(model, tmp_path):
+    save_controller(tmp_path / "controller", "point", SETTINGS.sac, model.controller, {"command": "ct-jax train point"})
+    return tmp_path
+
+
+def test_a_controller_acts_as_before(model, controller_folder):
+    _, proprio, goal = observations()
+    for where in (controller_folder, controller_folder / "controller"):  # a run's folder, or the controller's own
+        found, config = load_controller(str(where), "point")
+        np.testing.assert_array_equal(found(proprio, goal), model.controller(proprio, goal))
+        assert config == SETTINGS.sac
+
+
+def test_the_controller_of_another_robot_is_refused_and_both_are_described(controller_folder):
+    with pytest.raises(UserError) as refusal:
+        load_controller(str(controller_folder), "ant")
+    for words in ("robot point, proprio 2, actions 2", "robot ant, proprio 27, actions 8", "controller.json"):
+        assert words in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"robot": "point", "proprio": 2, "actions": 2, "sac": {"speed": 1}}']
+)
+def test_a_damaged_description_of_a_controller_is_refused(controller_folder, text):
+    (controller_folder / "controller" / "controller.json").write_text(text)
+    with pytest.raises(UserError, match=r"controller\.json"):
+        load_controller(str(controller_folder), "point")
+
+
+def test_damaged_or_pickled_weights_of_a_controller_are_refused(controller_folder):
+    file = controller_folder / "controller" / "weights.safetensors"
+    whole = file.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x8c\x07pickled\x94."):
+        file.write_bytes(content)
+        with pytest.raises(UserError, match="not a whole safetensors file"):
+            load_controller(str(controller_folder), "point")
+
+
+def test_where_there_is_no_controller_the_ways_out_are_told(tmp_path):
+    with pytest.raises(UserError, match="give a run folder, 'zoo', or learn your 'own'"):
+        load_controller(str(tmp_path), "point")
