@@ -236,12 +236,15 @@ def _train(command: Train) -> None:
     prepare_jax()
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
+    from ct_jax.model import load_controller
     from ct_jax.presets import get_preset
     from ct_jax.run import Run, default_mazes, load_mazes
 
     seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
     pipeline.check_seed(command.seed)
+    if command.controller != "own":
+        load_controller(command.controller, command.robot)  # before a folder is made for it
     run = Run(
         folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
         robot=command.robot,

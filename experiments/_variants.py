@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ct_envs import UserError
 from ct_jax import pipeline
 from ct_jax import trajectories as storage
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
@@ -42,14 +43,32 @@ class Plan:
     baselines: Baselines | None = None
 
 
-def plan_for(robot: str, preset: str, *, controller: str) -> Plan:
-    """The rows of a robot's table. With "cpu": the method as published at the CPU's size, without returns (BC-CT),
-    fine-tuned (F-CT, Algorithm 4), the preset with what lifts it, and the baselines."""
+def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, ...] = ()) -> Plan:
+    """The rows of a robot's table, or those of them that are named.
+
+    With "cpu": the method as published at the CPU's size, without returns (BC-CT), fine-tuned (F-CT, Algorithm 4), the
+    preset with what lifts it, and the baselines.
+
+    Raises:
+        UserError: a variant that the preset does not have.
+    """
+    plan = _whole_plan(robot, preset, controller=controller)
+    known = [*plan.variants, *(["baselines"] if plan.baselines else [])]
+    for name in variants:
+        if name not in known:
+            raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {', '.join(known)}")
+    if not variants:
+        return plan
+    chosen = {name: settings for name, settings in plan.variants.items() if name in variants}
+    return Plan(chosen, plan.baselines if {"baselines", "published"} <= set(variants) else None)
+
+
+def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
     lifted = replace(get_preset(preset, robot), controller=controller)
     if preset != "cpu":
         return Plan({preset: lifted})
     published = replace(get_preset("published", robot), controller=controller)
-    variants = {
+    variants: dict[str, Settings] = {
         "published": published,
         "bc": replace(published, model=replace(published.model, returns=False)),
         "f-ct": replace(

@@ -26,6 +26,8 @@ class Options:
     """demo, cpu, published or paper."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
+    variants: tuple[str, ...] = ()
+    """Rows to run: published, bc, f-ct, cpu, baselines (which need published). By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path = Path("runs/ant")
@@ -36,7 +38,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Run the experiment."""
-    plan = plan_for("ant", options.preset, controller=options.controller)
+    plan = plan_for("ant", options.preset, controller=options.controller, variants=options.variants)
     rows = run_plan("ant", plan, preset=options.preset, seeds=options.seeds, out=options.out, engine=options.engine)
     write_results(RESULTS / f"ant-{options.preset}.json", " ".join(["python", *sys.argv]), rows)
 

@@ -26,6 +26,8 @@ class Options:
     """demo, cpu or paper."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
+    variants: tuple[str, ...] = ()
+    """Rows to run: published, bc, f-ct, cpu, baselines (which need published). By default all."""
     out: Path = Path("runs/point")
     """Folder of the runs; what is finished there is not run again."""
     engine: str = "auto"
@@ -34,7 +36,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Run the experiment."""
-    plan = plan_for("point", options.preset, controller="own")
+    plan = plan_for("point", options.preset, controller="own", variants=options.variants)
     rows = run_plan("point", plan, preset=options.preset, seeds=options.seeds, out=options.out, engine=options.engine)
     write_results(RESULTS / f"point-{options.preset}.json", " ".join(["python", *sys.argv]), rows)
 
