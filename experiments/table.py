@@ -29,12 +29,24 @@ def mean(value: float, interval: list[float], digits: int) -> str:
 def experiment_table(results: dict[str, Any]) -> list[str]:
     """One line for each maze, model and method, with 95 % intervals."""
     rows = results["rows"]
-    lines = ["| maze | model | method | success % | SPL | return / 100 | collided % |", "|---|---|---|---|---|---|---|"]
+    falls = any(row.get("fall_rate") for row in rows)
+    names = [
+        "maze",
+        "model",
+        "method",
+        "success %",
+        "SPL",
+        "return / 100",
+        "collided %",
+        *(["fell %"] if falls else []),
+    ]
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     for row in sorted(rows, key=lambda row: not row["seen"]):
         maze = f"{row['maze']} ({'seen' if row['seen'] else 'unseen'})"
         cells = [maze, f"{row['variant']}, seed {row['model_seed']}", row["method"], percent(row, "success")]
         cells += [mean(row["spl"], row["spl_ci95"], 2)]
         cells += [mean(row["return_scaled"], row["return_scaled_ci95"], 1), percent(row, "collision")]
+        cells += [percent(row, "fall")] if falls else []
         lines.append("| " + " | ".join(cells) + " |")
     made = {(row["commit"], row["hardware"], row["created"][:10]) for row in rows}
     commits, machines, days = (", ".join(sorted({m[i] for m in made})) for i in range(3))
