@@ -4,6 +4,8 @@ The maze and the tasks (starts and goals) are data that travel in ``state.info``
 have its own and a new maze compiles nothing.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,10 +35,10 @@ class MazeEnv(Env):
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
     velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
-    Action: [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or action
-    that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``, ``collision``
-    (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``, ``tasks`` and
-    ``key``.
+    Action: [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or
+    action that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``,
+    ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``,
+    ``tasks`` and ``key``.
     """
 
     def __init__(
@@ -122,7 +124,8 @@ class MazeEnv(Env):
 
     def _go_on(self, key: jax.Array, finished: State, fresh: State) -> tuple[PhysicsState, State]:
         """After a success, where tasks follow each other: the robot as it is, with the next goal."""
-        tasks, physics = finished.info["tasks"], fresh.pipeline_state
+        tasks: Tasks | None = finished.info["tasks"]
+        physics: Any = fresh.pipeline_state
         if tasks is None or tasks.follow is None:
             return physics, fresh
         won = finished.info["success"] > 0
