@@ -25,8 +25,8 @@ class Options:
     """Environments."""
     steps: int = 100
     """Control steps a call."""
-    robot: str = "point"
-    """Robot."""
+    robots: tuple[str, ...] = ("point", "ant")
+    """Robots."""
 
 
 def rollouts(env: MazeEnv, actions: jax.Array):
@@ -46,10 +46,17 @@ def rollouts(env: MazeEnv, actions: jax.Array):
 def main(options: Options) -> None:
     """Run and print."""
     results = Results("rollout")
+    for robot in options.robots:
+        measure(robot, options, results)
+    results.finish()
+
+
+def measure(robot: str, options: Options, results: Results) -> None:
+    """The lines of one robot."""
     maze = load_maze("antmaze-large")
     keys = jax.random.split(jax.random.key(0), options.envs)
     for maps in (True, False):
-        env = MazeEnv(options.robot, engine="mujoco", maze=maze, maps=maps)
+        env = MazeEnv(robot, engine="mujoco", maze=maze, maps=maps)
         actions = jax.random.uniform(
             jax.random.key(1), (options.steps, options.envs, env.action_size), minval=-1.0, maxval=1.0
         )
@@ -70,12 +77,11 @@ def main(options: Options) -> None:
         work = options.envs * options.steps
         what = "with maps" if maps else "proprioception only"
         results.add(
-            f"{options.robot}, {options.envs} environments, {what}", "steps/s", [work / t for t in ours],
+            f"{robot}, {options.envs} environments, {what}", "steps/s", [work / t for t in ours],
             against="raw mujoco.batch", ratios=[b / a for a, b in zip(ours, limit, strict=True)],
         )  # fmt: skip
         if not maps:
-            results.add(f"{options.robot}, raw mujoco.batch", "steps/s", [work / t for t in limit])
-    results.finish()
+            results.add(f"{robot}, raw mujoco.batch", "steps/s", [work / t for t in limit])
 
 
 if __name__ == "__main__":

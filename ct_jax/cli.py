@@ -84,7 +84,7 @@ class Evaluate:
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
-    """Run folder, or zoo:point for the model that ships with the package."""
+    """Run folder, or zoo:point or zoo:ant for the models that ship with the package."""
     maze: Annotated[str, arg(metavar="NAME|FILE")] = "antmaze-large"
     """Maze by name or text file."""
     episodes: Annotated[int, arg(metavar="N")] = 100
