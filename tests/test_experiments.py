@@ -35,6 +35,7 @@ def test_variants_can_be_chosen_and_unknown_ones_are_refused():
 
 
 def test_every_row_is_made_once_and_kept(tiny, tiny_settings, tmp_path, monkeypatch):
+    monkeypatch.setattr("_variants.default_mazes", lambda robot: (("antmaze-umaze",), ("antmaze-medium",)))
     settings = replace(tiny_settings, rounds=0)
     cql = CqlConfig(updates=2, batch=4, width=8, samples=1)
     plan = Plan({"one": settings}, Baselines(cql, replace(settings.sac, iterations=4, warmup=1)))

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from ct_envs import UserError, load_maze, robots
+from ct_envs import UserError, load_maze
 from ct_jax import pipeline
 from ct_jax import run as runs
 from ct_jax.checkpoint import read_json
@@ -291,31 +291,3 @@ def test_mazes_of_one_name_are_told_apart_or_refused(tmp_path):
     with pytest.raises(UserError, match="'floor' already"):
         runs.join_mazes(load_mazes((same,)), load_mazes((other,)))
     assert list(runs.join_mazes(load_mazes((same,)), load_mazes((same, "hall")))) == ["floor", "hall"]
-
-
-# ------------------------------------------------------------------------------------------- without compilation
-
-
-@pytest.mark.slow
-def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, monkeypatch, islands):
-    spec = dataclasses.replace(robots.POINT, horizon=2, goal_tolerance_m=1.5)
-    monkeypatch.setitem(robots.ROBOTS, "point", spec)
-    change = dataclasses.replace
-    fit = change(tiny_settings.fit, updates=1, batch=1, steps=2)
-    settings = change(
-        tiny_settings,
-        prm=change(tiny_settings.prm, samples=12),
-        sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
-        collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
-        fit=fit,
-        value=change(tiny_settings.value, fit=change(fit, steps=1)),
-        rounds=0,  # fine-tuning has a test of its own
-        episodes=2,
-    )
-
-    # What would take minutes op by op, and is tested elsewhere: a roadmap of a thousand points, and first parameters.
-    for name in ("draw_pairs", "init_params"):
-        monkeypatch.setattr(pipeline, name, jax.disable_jit(False)(getattr(pipeline, name)))
-    run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
-    assert pipeline.train(run).is_file()
-    assert {row["method"] for row in pipeline.results(run.folder)} == set(METHODS)

@@ -588,10 +588,13 @@ def test_what_a_pool_cannot_do_is_one_line(pool):
 
 
 INTERRUPTED = """
+import signal
+
 import numpy as np
 from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
 from ct_envs.turtlebot3_world import make_world
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born deaf to it
     with Turtlebot3Pool(2, processes=2) as pool:
         pool.reset([Episode(make_world(), np.array([1.0, 1.0]), np.array([4.0, 4.0]))] * 2)
         print(*pool.pids, flush=True)
@@ -617,7 +620,10 @@ def test_ctrl_c_and_a_killed_pool_leave_no_process(tmp_path, number):
         os.killpg(process.pid, number)  # as a terminal does: every process of the group gets it
     else:
         process.kill()
-    _, errors = process.communicate(timeout=30)
+    try:
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
     assert number != signal.SIGINT or (errors.count("Traceback") == 1 and errors.rstrip().endswith("KeyboardInterrupt"))
     deadline = time.monotonic() + 10
     while any(Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids):
