@@ -109,7 +109,7 @@ def run_to(
     Args:
         train: takes a state and a number of steps to the state after them and what to report.
         count: how many steps a state has behind it.
-        on_progress: told (steps done, report) after every ``chunk`` steps.
+        on_progress: told (steps done, report) after every ``chunk`` steps; what the report holds are floats.
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
@@ -119,7 +119,7 @@ def run_to(
         while done < total:
             state, report = train(state, min(chunk, total - done))
             done = count(state)
-            on_progress(done, report)
+            on_progress(done, jax.tree.map(float, report))
             if checkpoints is not None:
                 checkpoints.maybe_save(done, state)
     except KeyboardInterrupt:

@@ -131,8 +131,6 @@ def collect(
     Raises:
         UserError: too few successes within ``give_up * T`` episodes, or names that mean nothing.
     """
-    if config.starts not in STARTS:
-        raise UserError(f"no starts named '{config.starts}'; starts: {', '.join(STARTS)}")
     policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
     kept: list[Trajectories] = []
     successes = episodes = 0
@@ -166,7 +164,13 @@ class Batch:
 def draw_batch(
     key: jax.Array, env: MazeEnv, mazes: Maze, config: CollectConfig, prm: PrmConfig, *, first_maze: int = 0
 ) -> Batch:
-    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them."""
+    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them.
+
+    Raises:
+        UserError: ``config.starts`` means nothing.
+    """
+    if config.starts not in STARTS:
+        raise UserError(f"no starts named '{config.starts}'; starts: {', '.join(STARTS)}")
     n_maps = max(1, config.envs // config.reset_interval)
     per_map = -(-config.envs // n_maps)
     maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]

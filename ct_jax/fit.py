@@ -21,7 +21,7 @@ from ct_envs import Robot, UserError
 from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
-from ct_jax.trajectories import Trajectories, Window, pad, sample_windows, select
+from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -169,7 +169,7 @@ def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m:
         UserError: none is left.
     """
     last = np.maximum(np.asarray(data.length) - 1, 0)
-    keep = np.asarray(data.reward)[np.arange(data.n), last] > -goal_tolerance_m
+    keep = np.asarray(at_goal(np.asarray(data.reward)[np.arange(data.n), last], goal_tolerance_m))
     if not keep.any():
         raise UserError("no trajectory arrives at its goal; collect anew")
     if config.collision_free:
@@ -208,6 +208,6 @@ def fit(
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
     state = run_to(
         learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
-        lambda state: int(state.update), lambda done, loss: on_progress(done, float(loss)), checkpoints, chunk,
+        lambda state: int(state.update), on_progress, checkpoints, chunk,
     )  # fmt: skip
     return jax.device_get(state.params)

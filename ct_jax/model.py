@@ -121,9 +121,10 @@ def load_controller(
         raise UserError(f"no controller of robot '{robot}' in '{where}'; give a run folder, 'zoo', or learn your 'own'")
     file = folder / "controller.json"
     found = read_json(file, mend=mend)
-    sizes = {name: found.get(name) for name in _sizes(robot)}
-    if sizes != _sizes(robot):
-        words = [", ".join(f"{name} {value}" for name, value in each.items()) for each in (sizes, _sizes(robot))]
+    needed = _sizes(robot)
+    sizes = {name: found.get(name) for name in needed}
+    if sizes != needed:
+        words = [", ".join(f"{name} {value}" for name, value in each.items()) for each in (sizes, needed)]
         raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {mend}")
     try:
         config = sac_from_dict(found["sac"])

@@ -6,6 +6,8 @@ interrupted one has finished is kept.
 
 import functools
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +22,12 @@ from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
 from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
-from ct_jax.evaluate import METHODS, Episodes, Pairs, draw_pairs, evaluate
+from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, draw_pairs, evaluate
 from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.model import TrainedModel, blank_model, load_controller, load_model, save_controller, save_model
 from ct_jax.policy import TransformerPolicy
-from ct_jax.prm import Roadmap, build_roadmap
+from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, join_mazes, open_run, slug
 from ct_jax.trajectories import Trajectories
@@ -99,27 +101,37 @@ def _controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
     if run.done("controller") is not None:
         return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))
     roadmap = _prm(run)
-    with run.stage("controller") as (folder, info), Bar("controller", config.iterations) as bar:
-        checkpoints = Checkpoints(folder / "checkpoints")
-
-        def on_progress(done: int, values: dict[str, float]) -> None:
-            metrics.log("controller", done, **values)
-            bar.update(done, f"success {values['success']:.2f}")
-
-        controller, held_out = train_controller(
-            run.key("controller"), run.env, roadmap.maze, roadmap, config,
-            on_progress=on_progress, checkpoints=checkpoints,
-        )  # fmt: skip
-        checkpoints.close()
+    with run.stage("controller") as (folder, info):
+        with training(folder, "controller", config.iterations, metrics) as watch:
+            controller, held_out = train_controller(
+                run.key("controller"), run.env, roadmap.maze, roadmap, config, **watch
+            )
         save_controller(folder, run.robot, config, controller, _made(run) | {"held_out_success": held_out})
         info |= {"held_out_success": held_out}
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    drop_checkpoints(folder)
     return controller, config
 
 
-def _read_weights(run: Run, file: Path, like: Any) -> Any:
-    """Weights of a stage, on the device."""
-    return jax.tree.map(jnp.asarray, load_weights(file, like, mend=run.mend(file.parent.name)))
+@contextmanager
+def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[dict[str, Any]]:
+    """A training's bar, metrics, and checkpoints in the folder: its ``on_progress`` and ``checkpoints``."""
+    with Bar(name, total) as bar:
+        checkpoints = Checkpoints(folder / f"checkpoints-{name}")
+
+        def on_progress(done: int, report: float | dict[str, float]) -> None:
+            values = report if isinstance(report, dict) else {"loss": report}
+            metrics.log(name, done, **values)
+            shown = next((word for word in ("success", "loss") if word in values), None)
+            bar.update(done, f"{shown} {values[shown]:.4g}" if shown else "")
+
+        yield {"on_progress": on_progress, "checkpoints": checkpoints}
+        checkpoints.close()
+
+
+def drop_checkpoints(folder: Path) -> None:
+    """Delete what only an interrupted training needs."""
+    for left in folder.glob("checkpoints-*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 # -------------------------------------------------------------------------------------------- data and transformer
@@ -163,7 +175,7 @@ def _fit(run: Run, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
     with run.stage("fit") as (folder, info):
         policy = _fit_both(run, "fit", 0, policy, data, metrics)
         info |= {"parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params))}
-    _drop_checkpoints(folder)
+    drop_checkpoints(folder)
     return policy
 
 
@@ -208,23 +220,11 @@ def _fit_network(
     folder = run.folder / stage
     file = folder / f"{name}.safetensors"
     if file.is_file():
-        return _read_weights(run, file, params)
-    with Bar(name, learner.config.updates) as bar:
-        checkpoints = Checkpoints(folder / f"checkpoints-{name}")
-
-        def on_progress(done: int, value: float) -> None:
-            metrics.log(name, done, loss=value)
-            bar.update(done, f"loss {value:.4f}")
-
-        params = fit(key, learner, params, data, run.stacked, on_progress=on_progress, checkpoints=checkpoints)
-        checkpoints.close()
+        return jax.tree.map(jnp.asarray, load_weights(file, params, mend=run.mend(stage)))
+    with training(folder, name, learner.config.updates, metrics) as watch:
+        params = fit(key, learner, params, data, run.stacked, **watch)
     save_weights(file, params)
     return params
-
-
-def _drop_checkpoints(folder: Path) -> None:
-    for left in folder.glob("checkpoints-*"):
-        shutil.rmtree(left, ignore_errors=True)
 
 
 # ----------------------------------------------------------------------------------------------------- fine-tuning
@@ -241,7 +241,7 @@ def _finetune(
         for number in range(1, run.settings.rounds + 1):
             data = storage.concatenate([data, _recoveries(run, env, number, policy, controller)])
             policy = _fit_both(run, "finetune", number, policy, data, metrics)
-            _drop_checkpoints(folder)
+            drop_checkpoints(folder)
         info |= {"rounds": run.settings.rounds} | describe(data)
     return policy
 
@@ -277,21 +277,32 @@ def _evaluate(run: Run, model: TrainedModel) -> None:
     with run.stage("evaluate") as (folder, _):
         rows = []
         for name, maze in join_mazes(run.mazes, run.eval_mazes).items():
-            pairs = stored_pairs(folder, run.spec, name, maze, run.settings.episodes, run.settings.pairs_seed)
-            for method in METHODS:
-                file = folder / f"{slug(name)}-{method}.json"
-                if not file.is_file():
-                    episodes = _evaluate_method(env, maze, pairs, method, model, name)
-                    save_episodes(file.with_suffix(".npz"), episodes)
-                    write_json(file, result_row(run.robot, method, name, episodes) | {"seen": name in run.mazes})
-                rows.append(read_json(file))
+            who = {"policy": model.policy, "controller": model.controller}
+            rows += [evaluated(run, env, folder, name, maze, method, **who) for method in METHODS]
         write_json(folder / "results.json", {"rows": rows})
 
 
-def _evaluate_method(env: MazeEnv, maze: Maze, pairs: Pairs, method: str, model: TrainedModel, name: str) -> Episodes:
+def evaluated(
+    run: Run, env: MazeEnv, folder: Path, name: str, maze: Maze, method: str, *, policy: Learned,
+    controller: SacController | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """A method's row of the table for one maze, with its episodes beside it in the folder; once there, read back."""
+    file = folder / f"{slug(name)}-{method}.json"
+    if not file.is_file():
+        pairs = _stored_pairs(run, name, maze)
+        episodes = _watched(env, maze, pairs, method, name, policy, controller, run.settings.prm)
+        _save_episodes(file.with_suffix(".npz"), episodes)
+        write_json(file, result_row(run.robot, method, name, episodes) | {"seen": name in run.mazes})
+    return read_json(file)
+
+
+def _watched(
+    env: MazeEnv, maze: Maze, pairs: Pairs, method: str, name: str, policy: Learned,
+    controller: SacController | None, prm: PrmConfig,
+) -> Episodes:  # fmt: skip
     with Bar(f"{method} in {name}", len(pairs.start)) as bar:
         return evaluate(
-            env, maze, pairs, method, policy=model.policy, controller=model.controller, prm=model.settings.prm,
+            env, maze, pairs, method, policy=policy, controller=controller, prm=prm,
             on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
         )  # fmt: skip
 
@@ -302,7 +313,7 @@ def result_row(robot: str, method: str, maze: str, episodes: Episodes) -> dict[s
     return {"robot": robot, "method": method, "maze": maze} | pairs | episodes.summary()
 
 
-def save_episodes(file: Path, episodes: Episodes) -> None:
+def _save_episodes(file: Path, episodes: Episodes) -> None:
     """Write what happened, for the report's pictures."""
     arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
@@ -310,9 +321,10 @@ def save_episodes(file: Path, episodes: Episodes) -> None:
     np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
-def stored_pairs(folder: Path, robot: Robot, name: str, maze: Maze, n: int, seed: int) -> Pairs:
+def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
     """The evaluation's pairs: drawn once, written down, and read back ever after."""
-    file = folder / f"pairs-{slug(name)}-{n}-{seed}.json"
+    robot, n, seed = run.spec, run.settings.episodes, run.settings.pairs_seed
+    file = run.folder / "evaluate" / f"pairs-{slug(name)}-{n}-{seed}.json"
     if file.is_file():
         found = read_json(file)
         start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
@@ -343,7 +355,9 @@ def evaluate_model(run: str, maze: str, *, episodes: int, seed: int, method: str
     env = MazeEnv(model.robot, engine=engine, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
     robot = env.robot
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    return result_row(model.robot, method, maze, _evaluate_method(env, world, pairs, method, model, Path(maze).stem))
+    prm, name = model.settings.prm, Path(maze).stem
+    outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, prm)
+    return result_row(model.robot, method, maze, outcome)
 
 
 def check_seed(seed: int) -> None:

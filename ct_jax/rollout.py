@@ -47,7 +47,6 @@ class Steps:
     learn: Float[Array, "T N"]  # 1 where the action is to be imitated
     alive: Float[Array, "T N"]  # 1 where the episode was still running before the action
     success: Float[Array, "T N"]
-    fall: Float[Array, "T N"]
     collision: Float[Array, "T N"]
 
 
@@ -71,7 +70,6 @@ def rollout(
             learn=action.learn,
             alive=1.0 - state.done,
             success=after.info["success"],
-            fall=after.info["fall"],
             collision=after.info["collision"],
         )
         return (after, memory), record

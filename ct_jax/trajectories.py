@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt8
 
 from ct_envs import UserError
-from ct_envs.frames import Symmetries
+from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 
@@ -54,6 +54,11 @@ class Trajectories:
     @property
     def nbytes(self) -> int:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+
+def at_goal(reward: jax.Array | np.ndarray, tolerance_m: float) -> jax.Array | np.ndarray:
+    """Whether a step's reward, minus the distance to the goal after it [m], tells of an arrival."""
+    return reward > -tolerance_m
 
 
 def select(trajectories: Trajectories, index: np.ndarray) -> Trajectories:
@@ -168,7 +173,6 @@ def sample_windows(
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:
     """Apply the symmetries ``which`` of a robot to pieces of its trajectories and their maps."""
     world, proprio, action = (jnp.asarray(matrices)[which] for matrices in symmetries)
-    apply = lambda matrices, values: jnp.einsum("bij,bsj->bsi", matrices, values)  # noqa: E731
 
     def grid(values: jax.Array) -> jax.Array:
         pick = lambda bit, a: jnp.where(bit[:, None, None, None, None], a, values)  # noqa: E731
@@ -178,8 +182,8 @@ def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Windo
 
     return window.replace(
         map=grid(window.map),
-        proprio=apply(proprio, window.proprio),
-        goal=apply(world, window.goal),
-        action=apply(action, window.action),
-        target=apply(action, window.target),
+        proprio=transform(proprio, window.proprio),
+        goal=transform(world, window.goal),
+        action=transform(action, window.action),
+        target=transform(action, window.target),
     )

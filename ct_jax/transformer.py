@@ -118,6 +118,13 @@ def body_features(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], 
     return heading, jnp.concatenate([own[..., :poses], own[..., poses:] / SPEED_SCALE], -1)
 
 
+def directions(x: Float[Array, "*b W"], heading: Float[Array, "*b 2"], n: int) -> Float[Array, "*b 2n"]:
+    """n planar vectors of the world from a dense layer, as a robot of that heading sees them; inside a module."""
+    where = nn.Dense(2 * n)(x)
+    where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], n, 2))
+    return where.reshape(*where.shape[:-2], -1)
+
+
 class HeadingHead(nn.Module):
     """Actions of a robot that can turn: where to go in the world, turned into the robot's frame, and how it stands.
 
@@ -131,9 +138,7 @@ class HeadingHead(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b A"]:
         heading, own = body_features(proprio)
-        where = nn.Dense(2 * self.directions)(x)
-        where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], self.directions, 2))
-        hidden = jnp.concatenate([where.reshape(*where.shape[:-2], -1), own], -1)
+        hidden = jnp.concatenate([directions(x, heading, self.directions), own], -1)
         for _ in range(2):
             hidden = nn.relu(nn.Dense(self.width)(hidden))
         return nn.Dense(self.action_size)(hidden)

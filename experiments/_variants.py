@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import tyro
 
 from ct_envs import UserError
 from ct_jax import pipeline
@@ -15,16 +16,46 @@ from ct_jax import trajectories as storage
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
 from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
 from ct_jax.baselines.sac_alone import train_sac_alone
-from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
-from ct_jax.cli import prepare_jax, print_rows
+from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
-from ct_jax.evaluate import evaluate
 from ct_jax.finetune import RecoverConfig
 from ct_jax.presets import Settings, get_preset
-from ct_jax.progress import Bar, Metrics
-from ct_jax.run import Run, default_mazes, join_mazes, load_mazes, slug
+from ct_jax.progress import Metrics
+from ct_jax.run import Run, default_mazes, join_mazes, load_mazes
 
 RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    preset: str = "cpu"
+    """demo, cpu, published or paper."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the trained models."""
+    variants: tuple[str, ...] = ()
+    """Rows to run: published, bc, f-ct, cpu, baselines (which need published). By default all."""
+    controller: str = "own"
+    """own, zoo, or a run folder."""
+    out: Path | None = None
+    """Folder of the runs (default: runs/ROBOT); what is finished there is not run again."""
+    engine: str = "auto"
+    """Physics: auto, mjx or mujoco."""
+
+
+def experiment(robot: str, about: str | None) -> int:
+    """Run a robot's experiment from the command line; returns the exit status."""
+
+    def run() -> None:
+        options = tyro.cli(Options, description=about)
+        plan = plan_for(robot, options.preset, controller=options.controller, variants=options.variants)
+        out = options.out or Path("runs") / robot
+        rows = run_plan(robot, plan, preset=options.preset, seeds=options.seeds, out=out, engine=options.engine)
+        _write_results(RESULTS / f"{robot}-{options.preset}.json", " ".join(["python", *sys.argv]), rows)
+
+    return guarded(run)
 
 
 @dataclass(frozen=True)
@@ -128,14 +159,13 @@ def run_baselines(run: Run, baselines: Baselines) -> list[dict[str, Any]]:
     """Train the baselines on a finished run's trajectories and in its maze, and evaluate them on its pairs."""
     sac = baselines.sac
 
-    def learn_cql(key: jax.Array, on_progress: Callable, checkpoints: Checkpoints) -> ActorPolicy:
+    def learn_cql(key: jax.Array, **watch: Any) -> ActorPolicy:
         data = storage.load(run.folder / "collect" / "trajectories.npz")
         learner = Cql(baselines.cql, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
-        return train_cql(key, learner, data, run.stacked, on_progress=on_progress, checkpoints=checkpoints)
+        return train_cql(key, learner, data, run.stacked, **watch)
 
-    def learn_sac(key: jax.Array, on_progress: Callable, checkpoints: Checkpoints) -> ActorPolicy:
-        maze = next(iter(run.mazes.values()))
-        return train_sac_alone(key, run.env, maze, sac, on_progress=on_progress, checkpoints=checkpoints)
+    def learn_sac(key: jax.Array, **watch: Any) -> ActorPolicy:
+        return train_sac_alone(key, run.env, next(iter(run.mazes.values())), sac, **watch)
 
     cql = baselines.cql
     rows = _baseline(run, "pt-cql", learn_cql, cql.updates, cql.width, cql.frame)
@@ -153,37 +183,20 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
     file = folder / "weights.safetensors"
     if not file.is_file():
         metrics = Metrics(folder)
-        with Bar(name, total) as bar:
-
-            def on_progress(done: int, values: dict[str, float]) -> None:
-                metrics.log(name, done, **values)
-                bar.update(done)
-
-            checkpoints = Checkpoints(folder / "checkpoints")
-            learned = learn(jax.random.fold_in(run.key("fit"), total), on_progress, checkpoints)
-            checkpoints.close()
+        with pipeline.training(folder, name, total, metrics) as watch:
+            learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
         metrics.close()
         save_weights(file, learned.params)
+        pipeline.drop_checkpoints(folder)
     policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
-    rows = []
-    for maze_name, maze in join_mazes(run.mazes, run.eval_mazes).items():
-        kept = folder / f"{slug(maze_name)}.json"
-        if not kept.is_file():
-            pairs = pipeline.stored_pairs(
-                run.folder / "evaluate", run.spec, maze_name, maze, run.settings.episodes, run.settings.pairs_seed
-            )
-            episodes = evaluate(env, maze, pairs, name, policy=policy)
-            pipeline.save_episodes(kept.with_suffix(".npz"), episodes)
-            row = pipeline.result_row(run.robot, name, maze_name, episodes)
-            write_json(kept, row | {"seen": maze_name in run.mazes})
-        rows.append(read_json(kept))
-    return rows
+    mazes = join_mazes(run.mazes, run.eval_mazes).items()
+    return [pipeline.evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
 
 
 # --------------------------------------------------------------------------------------------------------- results
 
 
-def write_results(file: Path, command: str, rows: list[dict[str, Any]]) -> None:
+def _write_results(file: Path, command: str, rows: list[dict[str, Any]]) -> None:
     """Write the rows with the command that made them, and print them."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, {"command": command, "rows": rows})

@@ -150,7 +150,7 @@ def test_what_came_after_the_end_counts_for_nothing():
     alive = np.array([[1, 1], [1, 1], [1, 0], [0, 0]], np.float32)
     ones = np.ones((4, 2), np.float32)
     pairs = np.arange(16, dtype=np.float32).reshape(4, 2, 2)
-    steps = Steps(pairs, pairs, pairs, pairs, -ones, ones, alive, ones, 0 * ones, ones)
+    steps = Steps(pairs, pairs, pairs, pairs, -ones, ones, alive, ones, ones)
     data = to_trajectories(steps, np.zeros((2, 2)), np.array([0, 1]))
     np.testing.assert_array_equal(data.length, [3, 2])
     np.testing.assert_array_equal(data.learn, alive.T)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from ct_envs import UserError, load_maze
+from ct_envs import UserError, load_maze, robots
 from ct_jax import pipeline
 from ct_jax import run as runs
 from ct_jax.checkpoint import read_json
@@ -167,7 +167,7 @@ def test_a_signal_during_physics_waits_for_the_program(tiny, tiny_run, tmp_path,
     assert main([*tiny_run.arguments, "--out", str(tmp_path / "run")]) == 130
     err = capsys.readouterr().err
     assert "Traceback" not in err and err.splitlines()[-1].startswith("stopped; ")
-    assert list((tmp_path / "run" / "controller" / "checkpoints").glob("[0-9]*"))
+    assert list((tmp_path / "run" / "controller" / "checkpoints-controller").glob("[0-9]*"))
 
 
 def test_time_adds_up_over_interruptions(tmp_path, tiny_settings, monkeypatch):
@@ -291,3 +291,33 @@ def test_mazes_of_one_name_are_told_apart_or_refused(tmp_path):
     with pytest.raises(UserError, match="'floor' already"):
         runs.join_mazes(load_mazes((same,)), load_mazes((other,)))
     assert list(runs.join_mazes(load_mazes((same,)), load_mazes((same, "hall")))) == ["floor", "hall"]
+
+
+# ------------------------------------------------------------------------------------------- without compilation
+
+
+@pytest.mark.slow
+def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, monkeypatch, islands):
+    spec = dataclasses.replace(robots.POINT, horizon=2, goal_tolerance_m=1.5)
+    monkeypatch.setitem(robots.ROBOTS, "point", spec)
+    change = dataclasses.replace
+    fit = change(tiny_settings.fit, updates=1, batch=1, steps=2)
+    settings = change(
+        tiny_settings,
+        prm=change(tiny_settings.prm, samples=12),
+        sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
+        collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
+        recover=change(tiny_settings.recover, stuck_steps=1, patience=1),
+        fit=fit,
+        value=change(tiny_settings.value, fit=change(fit, steps=1)),
+        episodes=2,
+    )
+
+    # What would take minutes op by op, and is tested elsewhere: planner and explorer, a roadmap of a thousand points,
+    # and first parameters.
+    monkeypatch.setattr(pipeline, "METHODS", ("ct",))
+    for name in ("draw_pairs", "init_params"):
+        monkeypatch.setattr(pipeline, name, jax.disable_jit(False)(getattr(pipeline, name)))
+    run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
+    assert pipeline.train(run).is_file()
+    assert [row["method"] for row in pipeline.results(run.folder)] == ["ct"]

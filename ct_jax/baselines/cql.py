@@ -29,7 +29,7 @@ from ct_envs.maze import Maze
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.fit import data_mesh
-from ct_jax.trajectories import Trajectories, Window, sample_windows
+from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
 
 
 @dataclass(frozen=True)
@@ -88,11 +88,11 @@ class Transitions:
 def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
     """Pieces of two steps as transitions. The second may lie beyond the end, and then means nothing.
 
-    The reward is minus the distance after the step, so it tells an arrival from a trajectory that was cut short.
+    The reward tells an arrival from a trajectory that was cut short.
     """
     see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal[:, i])  # noqa: E731
     reward, last = window.reward[:, 0], 1.0 - window.valid[:, 1]
-    arrived = last * (reward > -goal_tolerance_m)
+    arrived = last * at_goal(reward, goal_tolerance_m)
     known = window.valid[:, 0] * (1.0 - last + arrived)
     return Transitions(see(0), window.action[:, 0], reward, see(1), arrived, known)
 
@@ -233,7 +233,7 @@ def train_cql(
     state = run_to(
         learner.config.updates, state, lambda state, n: learner.train(state, data, mazes, n),
         lambda state: int(state.update),
-        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        on_progress,
         checkpoints, chunk,
     )  # fmt: skip
     return jax.device_get(learner.policy(state))

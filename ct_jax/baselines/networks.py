@@ -10,12 +10,9 @@ from brax.training.distribution import NormalTanhDistribution
 from flax import struct
 from jaxtyping import Array, Float, UInt8
 
-from ct_envs.frames import turn
 from ct_envs.occupancy import MAP_CELLS
 from ct_jax.rollout import Action, act_as_meant
-from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, body_features, goal_features
-
-DIRECTIONS = 16  # planar vectors that are handed to a body with a heading
+from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_features, directions, goal_features
 
 
 class Seen(NamedTuple):
@@ -47,9 +44,7 @@ def _perceive(seen: Seen, width: int, frame: str) -> Float[Array, "*b F"]:
         return nn.relu(nn.Dense(width)(jnp.concatenate([*place, seen.proprio], -1)))
     heading, body = body_features(seen.proprio)
     x = nn.relu(nn.Dense(width)(jnp.concatenate([*place, heading, body], -1)))
-    where = nn.Dense(2 * DIRECTIONS)(x)
-    where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], DIRECTIONS, 2))
-    return jnp.concatenate([x, where.reshape(*where.shape[:-2], -1), body], -1)
+    return jnp.concatenate([x, directions(x, heading, ModelConfig.directions), body], -1)
 
 
 class Actor(nn.Module):

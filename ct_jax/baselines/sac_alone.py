@@ -81,7 +81,7 @@ def train_sac_alone(
     sac = SacAlone(env, config)
     state = run_to(
         config.iterations, sac.create(key, maze, None), sac.train, lambda state: int(state.iteration),
-        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        on_progress,
         checkpoints, chunk,
     )  # fmt: skip
     return ActorPolicy(jax.device_get(state.average), env.action_size, config.hidden[0], config.frame)

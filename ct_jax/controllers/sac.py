@@ -24,7 +24,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
-from ct_envs.frames import own_frame, symmetries, turn
+from ct_envs.frames import own_frame, symmetries, transform, turn
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.prm import Roadmap
@@ -187,7 +187,7 @@ class Sac:
         self.reward = env.robot.controller_reward
         updates = config.iterations * config.updates
         rate = optax.linear_schedule(config.learning_rate, config.final_rate * config.learning_rate, updates)
-        self._optimizer = optax.adam(rate if config.final_rate < 1.0 else config.learning_rate)
+        self._optimizer = optax.adam(rate)
         alpha_loss, critic_loss, actor_loss = sac_losses.make_losses(
             self.networks, reward_scaling=config.reward_scale, discounting=config.discount, action_size=env.action_size
         )
@@ -337,9 +337,9 @@ class Sac:
         if self._symmetries is not None:
             pick = jax.random.randint(key, (len(action),), 0, len(self._symmetries.world))
             world, proprio, joints = (jnp.asarray(matrices)[pick] for matrices in self._symmetries)
-            apply = lambda matrices, rows: jnp.einsum("bij,bj->bi", matrices, rows)  # noqa: E731
-            whole = lambda o: jnp.concatenate([apply(proprio, o[:, :-2]), apply(world, o[:, -2:])], -1)  # noqa: E731
-            now, action, after = whole(now), apply(joints, action), whole(after)
+            halves = lambda o: (transform(proprio, o[:, :-2]), transform(world, o[:, -2:]))  # noqa: E731
+            now, after = (jnp.concatenate(halves(o), -1) for o in (now, after))
+            action = transform(joints, action)
         return batch._replace(observation=self._see(now, maze), action=action, next_observation=self._see(after, maze))
 
     def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
@@ -425,7 +425,7 @@ def train_controller(
     state = sac.create(train_key, maze, train_tasks)
     state = run_to(
         config.iterations, state, sac.train, lambda state: int(state.iteration),
-        lambda done, metrics: on_progress(done, {name: float(value) for name, value in metrics.items()}),
+        on_progress,
         checkpoints, chunk,
     )  # fmt: skip
     act = SacController(state.normalizer, state.average, env.action_size, config.hidden, config.frame, config.effort)

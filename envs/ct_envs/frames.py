@@ -26,6 +26,11 @@ class Symmetries(NamedTuple):
     action: np.ndarray  # [G, A, A]
 
 
+def transform(matrices: Float[Array, "B i j"], vectors: Float[Array, "B *s j"]) -> Float[Array, "B *s i"]:
+    """Each row's vectors by that row's matrix."""
+    return jnp.einsum("bij,b...j->b...i", matrices, vectors)
+
+
 _FLIP_X = np.array([[-1.0, 0.0], [0.0, 1.0]])
 _SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 
