@@ -113,7 +113,9 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)
     # Alone, the maze is the task: longer ways, so a longer view.
-    sac = replace(lifted.sac, discount=0.99, chain=False, mirror=False, iterations=lifted.sac.iterations // 2)
+    sac = replace(
+        lifted.sac, discount=0.99, chain=False, mirror=False, relabel=0.0, iterations=lifted.sac.iterations // 2
+    )
     return Plan(variants, Baselines(cql, sac))
 
 

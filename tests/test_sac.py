@@ -261,6 +261,32 @@ def test_the_ants_controller_does_not_see_the_world_turn():
     assert not np.allclose(actions, controller(jnp.tile(proprio, (4, 1)), group.world[turns] @ goal), atol=1e-2)
 
 
+@pytest.mark.parametrize("kind", ["velocity", "distance"])
+def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, roadmap):
+    """The same way through the world, another goal: what the reward, arrivals included, would have said of it."""
+    config = replace(TINY, envs=64, relabel=0.6, relabel_m=1.0)
+    sac = make(config, replace(POINT, controller_reward=kind))
+    state = sac.create(jax.random.key(1), UMAZE, split_edges(roadmap, 0.2, 0)[0]).env
+    after = jax.jit(jax.vmap(sac.env.step))(state, jnp.ones((64, 2)))
+    over = (np.arange(64) % 4 == 0) | (np.asarray(after.done) > 0)
+    seen = [jnp.concatenate([s.obs["proprio"], s.obs["goal"]], -1) for s in (state, after)]
+    batch = Transition(seen[0], jnp.ones((64, 2)), jax.jit(sac._reward)(state, after), 1.0 - over, seen[1], {})
+    told = sac._relabel(batch, jax.random.key(0))
+    changed = np.asarray((told.observation != batch.observation).any(-1))
+    assert not changed[over].any() and 0.4 < changed[~over].mean() < 0.8
+    old, new = ((b.observation - b.next_observation)[:, -2:] for b in (batch, told))
+    np.testing.assert_allclose(new, old, atol=1e-5)
+    np.testing.assert_array_equal(told.observation[:, :-2], batch.observation[:, :-2])
+    for name in ("observation", "next_observation", "reward", "discount"):
+        np.testing.assert_array_equal(getattr(told, name)[~changed], getattr(batch, name)[~changed])
+    before, left = (np.linalg.norm(o[changed, -2:], axis=-1) for o in (told.observation, told.next_observation))
+    arrived = left < POINT.goal_tolerance_m
+    assert arrived.any() and not arrived.all() and before.max() <= 1.0
+    dense = (before - left) / 0.1 if kind == "velocity" else -left
+    np.testing.assert_allclose(told.reward[changed], dense + config.arrival_bonus * arrived, atol=1e-3)
+    np.testing.assert_array_equal(told.discount[changed], 1.0 - arrived)
+
+
 def test_a_fall_costs_more_and_more():
     config = replace(TINY, iterations=10, fall_m=(5.0, 60.0), fall_ramp=(0.2, 0.8), discount=0.9)
     sac = make(config)

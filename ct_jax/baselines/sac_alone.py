@@ -29,8 +29,10 @@ class SacAlone(Sac):
     kept = 4
 
     def __init__(self, env: MazeEnv, config: SacConfig):
-        if config.mirror or config.chain:
-            raise UserError("SAC alone learns from its own steps and from fresh starts: set mirror and chain to False")
+        if config.mirror or config.chain or config.relabel:
+            raise UserError(
+                "SAC alone learns from its own steps and from fresh starts: set mirror and chain to False, relabel to 0"
+            )
         super().__init__(env, config)
         self.reward = "distance"
 

@@ -60,6 +60,10 @@ class SacConfig:
     held_out: float = 0.1  # share of the edges kept for the final test
     frame: str = "world"  # of what the networks see: the "world"'s, or the robot's own "heading"
     mirror: bool = False  # replay each transition as one of the robot's symmetries would have it
+    relabel: float = (
+        0.0  # share of the replayed steps that are given a goal drawn around the robot: plans turn anywhere
+    )
+    relabel_m: float = 10.0  # how far off those goals are, at most [m]
     chain: bool = False  # after a success go on from there along a next edge, as a plan does
     reward_scale: float = 1.0  # of the reward in the losses
 
@@ -304,17 +308,48 @@ class Sac:
 
         Of a fall it is minus the distance, whatever the robot's reward: see ``_pay_falls``.
         """
-        robot, config = self.env.robot, self.config
+        config = self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
-        dense = {
-            "velocity": (distance + after.reward) / robot.control_dt_s,
-            "distance": after.reward,
-        }[self.reward]
+        dense = self._towards(distance, -after.reward)
         if config.tilt_m:
             up = own_frame(after.obs["proprio"])[1][..., 3]  # pyright: ignore
             dense -= config.tilt_m * (1.0 - up)
         dense += config.arrival_bonus * after.done * after.info["success"]
         return jnp.where(after.done * after.info["fall"] > 0, after.reward, dense)
+
+    def _towards(self, before_m: jax.Array, after_m: jax.Array) -> jax.Array:
+        """The reward of a step that begins and ends at these distances from the goal [m]."""
+        return (before_m - after_m) / self.env.robot.control_dt_s if self.reward == "velocity" else -after_m
+
+    def _relabel(self, batch: Transition, key: jax.Array) -> Transition:
+        """The batch with other goals for some of the steps, and what they would have earned on the way there.
+
+        Steps that ended an episode stay as they are: the goal after them is the next one's.
+        """
+        config, tolerance = self.config, self.env.robot.goal_tolerance_m
+        which_key, angle_key, far_key = jax.random.split(key, 3)
+        shape = batch.reward.shape
+        chosen = jax.random.bernoulli(which_key, config.relabel, shape) & (batch.discount > 0)
+        angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
+        distance = jax.random.uniform(far_key, shape, minval=tolerance, maxval=config.relabel_m)
+        goal = distance[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+        old, old_after = batch.observation[:, -2:], batch.next_observation[:, -2:]
+        after = goal - (old - old_after)
+        length = lambda vectors: jnp.linalg.norm(vectors, axis=-1)  # noqa: E731
+        arrived = length(after) < tolerance
+        reward = batch.reward - self._towards(length(old), length(old_after)) + config.arrival_bonus * arrived
+        reward += self._towards(length(goal), length(after))
+        put = (
+            lambda all_of_it, goals: jnp.where(  # noqa: E731
+                chosen[:, None], jnp.concatenate([all_of_it[:, :-2], goals], -1), all_of_it
+            )
+        )
+        return batch._replace(
+            observation=put(batch.observation, goal),
+            next_observation=put(batch.next_observation, after),
+            reward=jnp.where(chosen, reward, batch.reward),
+            discount=jnp.where(chosen, 1.0 - arrived, batch.discount),
+        )
 
     def _pay_falls(self, batch: Transition, iteration: jax.Array) -> Transition:
         """The batch with falls paid like lying for ever, ``fall_m`` farther off, as they cost by now.
@@ -333,9 +368,12 @@ class Sac:
 
     def _present(self, batch: Transition, maze: Maze, key: jax.Array) -> Transition:
         """A batch from the replay as the networks see it."""
+        mirror_key, goal_key = jax.random.split(key)
+        if self.config.relabel:
+            batch = self._relabel(batch, goal_key)
         now, action, after = batch.observation, batch.action, batch.next_observation
         if self._symmetries is not None:
-            pick = jax.random.randint(key, (len(action),), 0, len(self._symmetries.world))
+            pick = jax.random.randint(mirror_key, (len(action),), 0, len(self._symmetries.world))
             world, proprio, joints = (jnp.asarray(matrices)[pick] for matrices in self._symmetries)
             halves = lambda o: (transform(proprio, o[:, :-2]), transform(world, o[:, -2:]))  # noqa: E731
             now, after = (jnp.concatenate(halves(o), -1) for o in (now, after))

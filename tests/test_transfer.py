@@ -1,0 +1,43 @@
+"""Transfer: the trunk is the old robot's, the body the new one's, and nothing else is mixed up."""
+
+import jax
+import numpy as np
+import pytest
+
+from ct_envs import UserError
+from ct_jax.transfer import BODY, transfer
+from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+
+SIZE = {"layers": 1, "heads": 2, "width": 16, "context": 4, "context_acting": 4}
+
+
+def params(seed, proprio, actions, **changes):
+    model = ControlTransformer(ModelConfig(**(SIZE | changes)), actions)
+    return model.init(jax.random.key(seed), *sample_inputs(proprio, actions))
+
+
+@pytest.mark.parametrize(("proprio", "actions", "frame"), [(27, 8, "heading"), (27, 8, "world"), (2, 2, "world")])
+def test_the_trunk_is_kept_and_the_body_is_fresh(proprio, actions, frame):
+    source, fresh = params(0, 2, 2), params(1, proprio, actions, frame=frame)
+    moved = transfer(source, fresh)
+    assert jax.tree.structure(moved) == jax.tree.structure(fresh)
+    assert {"encode_map", "embed_return", "embed_timestep", "embed_goal", "norm_out"} < moved["params"].keys()
+    for name, leaves in moved["params"].items():
+        whose = fresh if name in BODY else source
+        jax.tree.map(np.testing.assert_array_equal, leaves, whose["params"][name])
+
+
+def test_transfer_to_itself_changes_only_the_body():
+    source = params(0, 2, 2)
+    jax.tree.map(np.testing.assert_array_equal, transfer(source, source), source)
+
+
+@pytest.mark.parametrize("changes", [{"width": 32}, {"max_timestep": 64}])
+def test_models_of_other_sizes_are_refused(changes):
+    with pytest.raises(UserError, match=r"has shape \(.*\), this robot's model needs \("):
+        transfer(params(0, 2, 2), params(1, 27, 8, **changes))
+
+
+def test_models_of_other_depths_are_refused():
+    with pytest.raises(UserError, match="differ in their layers"):
+        transfer(params(0, 2, 2), params(1, 27, 8, layers=2))
