@@ -339,11 +339,10 @@ class Sac:
         arrived = length(after) < tolerance
         reward = batch.reward - self._towards(length(old), length(old_after)) + config.arrival_bonus * arrived
         reward += self._towards(length(goal), length(after))
-        put = (
-            lambda all_of_it, goals: jnp.where(  # noqa: E731
-                chosen[:, None], jnp.concatenate([all_of_it[:, :-2], goals], -1), all_of_it
-            )
-        )
+
+        def put(seen: jax.Array, goals: jax.Array) -> jax.Array:
+            return jnp.where(chosen[:, None], jnp.concatenate([seen[:, :-2], goals], -1), seen)
+
         return batch._replace(
             observation=put(batch.observation, goal),
             next_observation=put(batch.next_observation, after),
