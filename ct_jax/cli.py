@@ -53,7 +53,7 @@ class Train:
     """
 
     robot: Annotated[Positional[str], arg(metavar="ROBOT")]
-    """Robot to train: point or ant."""
+    """Robot to train: point, ant or turtlebot3 (in PyBullet, in cluttered rooms instead of mazes)."""
     preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
     """How much of everything: demo (minutes), cpu (an hour on two cores), published (the bare method at that size) or
     paper (the published sizes; wants a GPU)."""
@@ -68,7 +68,7 @@ class Train:
     controller: Annotated[str, arg(metavar="own|zoo|RUN")] = "own"
     """Low-level controller: learn one's own, take the one that ships with the package, or that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
-    """Physics; auto is mujoco on CPU and mjx on accelerators."""
+    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in the folder: finished stages are skipped."""
 
@@ -81,20 +81,29 @@ class Evaluate:
       ct-jax evaluate zoo:point --maze antmaze-large-eval
       ct-jax evaluate runs/demo --maze my_floor.txt --episodes 20
       ct-jax evaluate runs/demo --method explorer --json > explorer.json
+      ct-jax evaluate runs/turtlebot3-cpu-0 --worlds 20 --pairs 25 --density 1.5 --noise 1
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
-    """Run folder, or zoo:point or zoo:ant for the models that ship with the package."""
-    maze: Annotated[str, arg(metavar="NAME|FILE")] = "antmaze-large"
+    """Run folder, or a model that ships with the package: zoo:point or zoo:ant."""
+    maze: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: antmaze-large)")] = None
     """Maze by name or text file."""
-    episodes: Annotated[int, arg(metavar="N")] = 100
-    """Start-goal pairs."""
+    episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 100)")] = None
+    """Start-goal pairs in a maze."""
+    worlds: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 20)")] = None
+    """Turtlebot3: random rooms."""
+    pairs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 25)")] = None
+    """Turtlebot3: start-goal pairs in each room."""
+    density: Annotated[float | None, arg(metavar="F", help_behavior_hint="(default: 1)")] = None
+    """Turtlebot3: how full the rooms are, 1 as in training."""
+    noise: Annotated[float | None, arg(metavar="F", help_behavior_hint="(default: 0)")] = None
+    """Turtlebot3: errors of sensors and motion, 1 as on a real robot."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the pairs; the same pairs for every method."""
     method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
     """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
-    engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
-    """Physics; auto is mujoco on CPU and mjx on accelerators."""
+    engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
+    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     json: FlagCreatePairsOff[bool] = False
     """Print one JSON object and nothing else."""
 
@@ -199,6 +208,8 @@ def _reason(text: str) -> str:
     gist = re.sub(r"Missing from [\w -]+:", "missing:", gist).replace(" (required)", "")
     gist = re.sub(r"Expected one of {(.*)}\.", r"give a command: \1", gist)
     gist = re.sub(r"invalid literal for int\(\) with base 10: (.*)", r"\1 is no whole number", gist.strip())
+    gist = re.sub(r"could not convert string to float: (.*)", r"\1 is no number", gist)
+    gist = re.sub(r"no type matching .*<class '(?:int|float|str)'>: ", "", gist)  # of an option that may be left out
     gist = gist.replace("Unrecognized options:", "unknown:").replace("Error parsing ", "").strip(" .")
     return gist or "unusable arguments"
 
@@ -232,7 +243,7 @@ def prepare_jax() -> None:
 def _train(command: Train) -> None:
     from ct_envs.robots import get_robot
 
-    get_robot(command.robot)  # before what takes seconds
+    _CHECKS[get_robot(command.robot).course](command)  # before what takes seconds
     prepare_jax()
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
@@ -260,19 +271,32 @@ def _train(command: Train) -> None:
     print(f"model:  {run.folder / 'model'}\nreport: {report}")
 
 
+def _check_in_maze(command: Train) -> None:
+    """What can be told of a training in mazes before anything is loaded: nothing yet."""
+
+
+def _check_in_rooms(command: Train) -> None:
+    """Raises UserError for options that mean nothing in rooms, or where PyBullet is missing."""
+    from ct_envs.turtlebot3 import load_pybullet
+
+    for name, default in (("maze", ()), ("eval_maze", ()), ("controller", "own"), ("engine", "auto")):
+        if getattr(command, name) != default:
+            option = name.replace("_", "-")
+            raise UserError(f"--{option} is not for the {command.robot}, which drives in random rooms; leave it out")
+    load_pybullet()
+
+
+_CHECKS: dict[str, Callable[[Train], None]] = {"maze": _check_in_maze, "room": _check_in_rooms}
+
+
 def _evaluate(command: Evaluate) -> None:
     with _stdout_to_stderr() if command.json else contextlib.nullcontext():
         prepare_jax()
         from ct_jax import pipeline
 
-        row = pipeline.evaluate_model(
-            command.run,
-            command.maze,
-            episodes=command.episodes,
-            seed=command.seed,
-            method=command.method,
-            engine=command.engine,
-        )
+        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise")
+        given = {name: value for name in names if (value := getattr(command, name)) is not None}
+        row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
     if command.json:
         print(json.dumps(row))
     else:
@@ -334,6 +358,7 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
     "return / 100": lambda row: f"{row['return_scaled']:.1f}",
     "collided %": lambda row: f"{100 * row['collision_rate']:.0f}",
     "fell %": lambda row: f"{100 * row.get('fall_rate', 0.0):.0f}",
+    "frontal %": lambda row: f"{100 * row['frontal_rate']:.0f}" if "frontal_rate" in row else "",
     "steps": lambda row: f"{row['steps_mean']:.0f}",
 }
 
@@ -343,10 +368,11 @@ def print_rows(rows: list[Row]) -> None:
     from rich.table import Table
 
     table = Table(box=None, header_style="bold")
-    for name in _COLUMNS:
+    columns = {name: show for name, show in _COLUMNS.items() if any(map(show, rows))}
+    for name in columns:
         table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(show(row) for show in _COLUMNS.values()))
+        table.add_row(*(show(row) for show in columns.values()))
     _console(width=None if sys.stdout.isatty() else 120).print(table)
 
 

@@ -132,6 +132,31 @@ def collect(
         UserError: too few successes within ``give_up * T`` episodes, or names that mean nothing.
     """
     policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
+
+    def wave(first: int) -> tuple[Trajectories, np.ndarray]:
+        batch_key, run_key = jax.random.split(jax.random.fold_in(key, first))
+        batch = draw_batch(batch_key, env, mazes, config, prm, first_maze=first // config.reset_interval)
+        memory = policy.init(batch.state, plan_memory(policy.guide, batch.tables, batch.which, batch.state))
+        state, _, steps = run_episodes(env, policy, batch.state, memory, run_key, limit=config.horizon)
+        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
+        return data, np.asarray(state.info["success"]) > 0
+
+    return gather(config, wave, on_progress)
+
+
+def gather(
+    config: CollectConfig,
+    wave: Callable[[int], tuple[Trajectories, np.ndarray]],
+    on_progress: Callable[[int, int], None],
+) -> Trajectories:
+    """The loop of Algorithm 3: episodes, wave after wave, until T have succeeded; only successes are kept.
+
+    Args:
+        wave: given the number of its first episode, ``config.envs`` episodes and which of them succeeded.
+
+    Raises:
+        UserError: too few successes within ``give_up * T`` episodes.
+    """
     kept: list[Trajectories] = []
     successes = episodes = 0
     while successes < config.trajectories:
@@ -140,12 +165,8 @@ def collect(
                 f"the controller reached only {successes} of {episodes} goals, {config.trajectories} were asked for; "
                 "train it longer or look at its success on edges"
             )
-        batch_key, run_key = jax.random.split(jax.random.fold_in(key, episodes))
-        batch = draw_batch(batch_key, env, mazes, config, prm, first_maze=episodes // config.reset_interval)
-        memory = policy.init(batch.state, plan_memory(policy.guide, batch.tables, batch.which, batch.state))
-        state, _, steps = run_episodes(env, policy, batch.state, memory, run_key, limit=config.horizon)
-        won = np.asarray(state.info["success"]) > 0
-        kept.append(select(to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze), won))
+        data, won = wave(episodes)
+        kept.append(select(data, won))
         successes, episodes = successes + int(won.sum()), episodes + config.envs
         on_progress(successes, episodes)
     return select(concatenate(kept), np.arange(config.trajectories))

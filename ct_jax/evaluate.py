@@ -31,6 +31,7 @@ class Pairs:
     goal: np.ndarray
     shortest_m: np.ndarray  # [n], on a dense roadmap
     seed: int
+    world: np.ndarray | None = None  # int [n]: which of several worlds each is in
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Episodes:
     pairs: Pairs
     wall_s: float
     asked: np.ndarray | None = None  # return asked for at the start
+    frontal: np.ndarray | None = None  # bool [n]: ran into something, where that is told from ...
+    grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
 
     def summary(self) -> dict[str, Any]:
         """Rates and means; intervals are 95 %: Wilson for rates, bootstrap over episodes for means."""
@@ -60,12 +63,19 @@ class Episodes:
         rows |= {"collision_rate": float(self.collided.mean()), "collision_ci95": wilson(self.collided)}
         rows |= {"fall_rate": float(self.fell.mean()), "fall_ci95": wilson(self.fell)}
         rows |= {"timeout_rate": float(self.timeout.mean()), "timeout_ci95": wilson(self.timeout)}
+        for name, told in (("frontal", self.frontal), ("grazing", self.grazing)):
+            rows |= {} if told is None else {f"{name}_rate": float(told.mean()), f"{name}_ci95": wilson(told)}
         return rows | {"steps_mean": float(self.steps.mean()), "wall_s": round(self.wall_s, 2)}
 
 
 def wilson(outcomes: np.ndarray) -> list[float]:
     """95 % interval of a rate."""
-    interval = stats.binomtest(int(np.sum(outcomes)), len(outcomes)).proportion_ci(0.95, method="wilson")
+    return wilson_of(int(np.sum(outcomes)), len(outcomes))
+
+
+def wilson_of(successes: int, tries: int) -> list[float]:
+    """The same from counts."""
+    interval = stats.binomtest(successes, tries).proportion_ci(0.95, method="wilson")
     return [float(interval.low), float(interval.high)]
 
 

@@ -17,7 +17,7 @@ from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, r
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action, Controller, Guided
-from ct_jax.trajectories import PER_STEP, Trajectories, concatenate, select
+from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, concatenate, select
 
 KEEP = ("separate", "joined", "relabelled")
 
@@ -111,30 +111,51 @@ def recover(
     Raises:
         UserError: too few recoveries within ``give_up * T`` episodes, or a ``keep`` that means nothing.
     """
-    if config.keep not in KEEP:
-        raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
+
+    def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
+        batch_key, run_key = jax.random.split(jax.random.fold_in(key, first))
+        batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first // collecting.reset_interval)
+        plan = plan_memory(guide, batch.tables, batch.which, batch.state)
+        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
+        state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
+        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
+        return data, np.asarray(state.info["success"]) > 0, np.asarray(state.info["fall"]) > 0
+
+    return gather_recoveries(config, collecting.envs, env.horizon, wave, on_progress)
+
+
+def gather_recoveries(
+    config: RecoverConfig,
+    envs: int,
+    horizon: int,
+    wave: Callable[[int], tuple[Trajectories, np.ndarray, np.ndarray]],
+    on_progress: Callable[[int, int], None],
+) -> Trajectories:
+    """The loop of Algorithm 4: supervised episodes, wave after wave, until T were recovered.
+
+    Args:
+        envs: episodes of a wave, of at most ``horizon`` steps.
+        wave: given the number of its first episode, its episodes, which of them succeeded, and which fell.
+
+    Raises:
+        UserError: as ``recover``.
+    """
+    if config.keep not in KEEP:
+        raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
     kept: list[Trajectories] = []
     recoveries = episodes = 0
     while recoveries < config.recoveries:
         if episodes >= config.give_up * config.recoveries:
             break
-        batch_key, run_key = jax.random.split(jax.random.fold_in(key, episodes))
-        first = episodes // collecting.reset_interval
-        batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first)
-        plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
-        state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
-        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
-        rescued = np.asarray(state.info["success"]) > 0
+        data, rescued, fell = wave(episodes)
         if config.keep == "relabelled":  # the transformer's own successes are told what is better, too, and its falls
-            fell = np.asarray(state.info["fall"]) > 0
-            data, rescued = lie_for_ever(data, fell, env.horizon), rescued | fell
+            data, rescued = lie_for_ever(data, fell, horizon), rescued | fell
         else:
-            rescued &= data.learn.sum(1) > 0
+            rescued = rescued & (data.learn.sum(1) > 0)
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
-        recoveries, episodes = recoveries + int(rescued.sum()), episodes + collecting.envs
+        recoveries, episodes = recoveries + int(rescued.sum()), episodes + envs
         on_progress(recoveries, episodes)
     if not recoveries:
         raise UserError(f"no recovery in {episodes} episodes; the policy hardly fails, so skip fine-tuning")
@@ -156,6 +177,6 @@ def _split(data: Trajectories) -> list[Trajectories]:
     fail = data.replace(length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None]))
     later = np.minimum(np.arange(learn.shape[1]) + begin[:, None], learn.shape[1] - 1)
     row = np.arange(data.n)[:, None]
-    moved = {name: np.asarray(getattr(data, name))[row, later] for name in PER_STEP}
+    moved = {name: leaf[row, later] for name, leaf in arrays_of(data).items() if name in (*PER_STEP, *OBSERVED)}
     recovery = replace(data, **moved, length=np.asarray(data.length) - begin)
     return [select(fail, begin > 0), recovery]

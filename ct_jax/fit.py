@@ -96,7 +96,7 @@ class Fit:
         return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self.mesh, PartitionSpec()))
 
     def _train(
-        self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze, updates: int
+        self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze | None, updates: int
     ) -> tuple[FitState, jax.Array]:
         """Run some updates (static); returns the mean loss over them."""
         shard = NamedSharding(self.mesh, PartitionSpec("data"))
@@ -189,15 +189,17 @@ def fit(
     learner: Fit,
     params: Any,
     data: Trajectories,
-    mazes: Maze,
+    mazes: Maze | None,
     *,
     on_progress: Callable[[int, float], None] = lambda update, loss: None,
     checkpoints: Checkpoints | None = None,
     chunk: int = 20,
+    updates: int | None = None,
 ) -> Any:
     """Train to the configured number of updates; returns the parameters, on the host.
 
     Args:
+        updates: stop already after so many; ``checkpoints`` allow to go on from there.
         on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
@@ -207,7 +209,7 @@ def fit(
     place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
     data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
     state = run_to(
-        learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
+        updates or learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
         lambda state: int(state.update), on_progress, checkpoints, chunk,
     )  # fmt: skip
     return jax.device_get(state.params)

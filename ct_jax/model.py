@@ -1,4 +1,4 @@
-"""A trained model as it is shipped: transformer, value network and controller in one folder, without pickle.
+"""A trained model as it is shipped: transformer, value network and a learned controller in one folder, without pickle.
 
 ``weights.safetensors`` holds the arrays, ``model.json`` the robot, the settings and where they came from.
 """
@@ -14,7 +14,9 @@ from brax.training.acme import running_statistics, specs
 
 from ct_envs import MazeEnv, UserError
 from ct_envs.robots import get_robot
+from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig, SacController, controller_networks, input_size
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
@@ -31,7 +33,7 @@ class TrainedModel:
     robot: str
     settings: Settings
     policy: TransformerPolicy
-    controller: SacController  # as ``settings.sac`` describes it
+    controller: SacController | DifferentialDrive  # learned, as ``settings.sac`` describes it, or known
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
 
@@ -91,7 +93,8 @@ def load_model(run: str) -> TrainedModel:
     like = _arrays(policy, controller)
     arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like, mend=mend))
     policy = replace(policy, params=arrays["transformer"], value_params=arrays["value"])
-    controller = replace(controller, normalizer=arrays["normalizer"], policy=arrays["controller"])
+    if isinstance(controller, SacController):
+        controller = replace(controller, normalizer=arrays["normalizer"], policy=arrays["controller"])
     return TrainedModel(robot, settings, policy, controller, made)
 
 
@@ -130,51 +133,63 @@ def load_controller(
         config = sac_from_dict(found["sac"])
     except (KeyError, TypeError, AttributeError) as bad:
         raise UserError(f"{file}: not a controller's description ({bad}); {mend}") from None
-    blank = blank_model(robot, Settings(sac=config))[1]
+    blank = jax.eval_shape(lambda key: _blank_sac(key, robot, config), jax.random.key(0))
     return jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", blank, mend=mend)), config
 
 
 def _sizes(robot: str) -> dict[str, Any]:
     """What a controller must agree in with its robot."""
-    env = MazeEnv(get_robot(robot), engine="mujoco")
-    return {"robot": robot, "proprio": env.proprio_size, "actions": env.action_size}
+    proprio, actions = sizes(robot)
+    return {"robot": robot, "proprio": proprio, "actions": actions}
 
 
-def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController]:
+def sizes(robot: str) -> tuple[int, int]:
+    """Entries of a robot's proprioception and of its action."""
+    if get_robot(robot).course == "room":
+        return PROPRIO_SIZE, ACTION_SIZE
+    env = MazeEnv(robot, engine="mujoco")
+    return env.proprio_size, env.action_size
+
+
+def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController | DifferentialDrive]:
     """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
-    env = MazeEnv(get_robot(robot), engine="mujoco")
-    maps, proprio, goal, *rest = sample_inputs(env.proprio_size, env.action_size)
-    transformer = ControlTransformer(settings.model, env.action_size)
+    proprio_size, action_size = sizes(robot)
+    maps, proprio, goal, *rest = sample_inputs(proprio_size, action_size)
+    transformer = ControlTransformer(settings.model, action_size)
     value = ValueNetwork(settings.value.width)
-    size = input_size(env.proprio_size, settings.sac.frame)
 
-    def build(key: jax.Array) -> tuple[TransformerPolicy, SacController]:
-        policy = TransformerPolicy(
+    def build(key: jax.Array) -> TransformerPolicy:
+        return TransformerPolicy(
             params=transformer.init(key, maps, proprio, goal, *rest),
             value_params=value.init(key, maps, proprio, goal),
             config=settings.model,
-            action_size=env.action_size,
+            action_size=action_size,
             value_width=settings.value.width,
             optimism=settings.optimism,
             reprompt=settings.reprompt,
         )
-        controller = SacController(
-            normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
-            policy=controller_networks(size, env.action_size, settings.sac.hidden).policy_network.init(key),
-            action_size=env.action_size,
-            hidden=settings.sac.hidden,
-            frame=settings.sac.frame,
-            effort=settings.sac.effort,
-        )
-        return policy, controller
 
-    return jax.eval_shape(build, jax.random.key(0))
+    policy = jax.eval_shape(build, jax.random.key(0))
+    if get_robot(robot).course == "room":
+        return policy, DifferentialDrive()
+    return policy, jax.eval_shape(lambda key: _blank_sac(key, robot, settings.sac), jax.random.key(0))
 
 
-def _arrays(policy: TransformerPolicy, controller: SacController) -> dict[str, Any]:
-    return {
-        "transformer": policy.params,
-        "value": policy.value_params,
-        "normalizer": controller.normalizer,
-        "controller": controller.policy,
-    }
+def _blank_sac(key: jax.Array, robot: str, config: SacConfig) -> SacController:
+    proprio_size, action_size = sizes(robot)
+    size = input_size(proprio_size, config.frame)
+    return SacController(
+        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
+        policy=controller_networks(size, action_size, config.hidden).policy_network.init(key),
+        action_size=action_size,
+        hidden=config.hidden,
+        frame=config.frame,
+        effort=config.effort,
+    )
+
+
+def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive) -> dict[str, Any]:
+    arrays = {"transformer": policy.params, "value": policy.value_params}
+    if isinstance(controller, SacController):
+        arrays |= {"normalizer": controller.normalizer, "controller": controller.policy}
+    return arrays

@@ -1,11 +1,14 @@
 """All settings of a run, and the presets: instances of them."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ct_envs import UserError
+from ct_envs.lidar import LIDAR_CELL_M
 from ct_envs.robots import get_robot
 from ct_jax.collect import CollectConfig
+from ct_jax.collect_turtlebot3 import RoomConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import RecoverConfig
 from ct_jax.fit import FitConfig, ValueConfig
@@ -32,6 +35,7 @@ class Settings:
     reprompt: bool = False  # never ask for more than V of the present state
     episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
     pairs_seed: int = 0  # their seed: not the run's, so that all models meet the same pairs
+    rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
 
 
 PAPER = Settings(
@@ -116,19 +120,70 @@ def _for_ant(settings: Settings) -> Settings:
     return replace(settings, model=model, rounds=min(settings.rounds, 6), **longer)
 
 
-_ADAPTED = {"point": lambda settings: settings, "ant": _for_ant}
+TURTLEBOT3_PAPER = Settings(
+    prm=PrmConfig(samples=150, connect_m=2.0),
+    collect=CollectConfig(trajectories=1000, reset_interval=25, envs=50, horizon=400),
+    model=ModelConfig(layers=4, heads=4, width=128, context=5, context_acting=5, map_cell_m=LIDAR_CELL_M),
+    fit=FitConfig(updates=15_000, batch=128, steps=5, learning_rate=1e-4, weight_decay=1e-4, warmup=10_000),
+    value=ValueConfig(fit=FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)),
+    recover=RecoverConfig(recoveries=500, stuck_steps=25, stuck_m=0.15, bumps=2, patience=300),
+    rounds=1,
+    round_fit=FitConfig(updates=7500, batch=128, steps=5, learning_rate=1e-4, weight_decay=1e-4, warmup=100),
+    episodes=25,
+    rooms=RoomConfig(),
+)
+"""The Turtlebot3 as published, table II: F-CT."""
+
+TURTLEBOT3_CPU = replace(
+    TURTLEBOT3_PAPER,
+    prm=replace(TURTLEBOT3_PAPER.prm, margin_m=0.08),
+    collect=replace(TURTLEBOT3_PAPER.collect, guide="shortcut", starts="maze", noise=0.3),
+    model=replace(TURTLEBOT3_PAPER.model, dropout=0.0),
+    value=ValueConfig(fit=replace(TURTLEBOT3_PAPER.value.fit, mirror=True)),
+    fit=replace(TURTLEBOT3_PAPER.fit, learning_rate=4e-4, warmup=500, mirror=True, decay=True),
+    recover=replace(TURTLEBOT3_PAPER.recover, keep="relabelled", takeover=0.01),
+    round_fit=replace(TURTLEBOT3_PAPER.fit, learning_rate=4e-4, warmup=500, mirror=True, decay=True),
+    reprompt=True,
+)
+"""What lifts it: ways with room to spare, free starts, disturbances, mirrored rooms, relabelled recoveries."""
+
+TURTLEBOT3_DEMO = replace(
+    TURTLEBOT3_CPU,
+    collect=replace(TURTLEBOT3_CPU.collect, trajectories=200),
+    value=ValueConfig(fit=replace(TURTLEBOT3_CPU.value.fit, updates=800)),
+    fit=replace(TURTLEBOT3_CPU.fit, updates=1500, learning_rate=1e-3, warmup=100),
+    recover=replace(TURTLEBOT3_CPU.recover, recoveries=100),
+    round_fit=replace(TURTLEBOT3_CPU.fit, updates=1500, learning_rate=1e-3, warmup=100),
+    episodes=5,
+    rooms=RoomConfig(worlds=10),
+)
+"""The same in minutes."""
+
+TURTLEBOT3_PRESETS = {
+    "demo": TURTLEBOT3_DEMO, "cpu": TURTLEBOT3_CPU, "published": TURTLEBOT3_PAPER, "paper": TURTLEBOT3_PAPER,
+}  # fmt: skip
+
+_OF_ROBOT: dict[str, Callable[[], dict[str, Settings]]] = {
+    "point": lambda: PRESETS,
+    "ant": lambda: {name: _for_ant(settings) for name, settings in PRESETS.items()},
+    "turtlebot3": lambda: TURTLEBOT3_PRESETS,
+}
 
 
 def get_preset(name: str, robot: str = "point") -> Settings:
     """The preset of that name for a robot. Raises UserError with the valid names."""
-    if name not in PRESETS:
-        raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(PRESETS))}")
-    return _ADAPTED[get_robot(robot).name](PRESETS[name])
+    presets = _OF_ROBOT[get_robot(robot).name]()
+    if name not in presets:
+        raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(presets))}")
+    return presets[name]
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:
     """The settings as JSON holds them."""
-    return asdict(settings)
+    values = asdict(settings)
+    if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
+        values.pop("rooms")
+    return values
 
 
 def from_dict(values: dict[str, Any]) -> Settings:
@@ -144,6 +199,7 @@ def from_dict(values: dict[str, Any]) -> Settings:
             value=ValueConfig(**value),
             fit=FitConfig(**values["fit"]),
             recover=RecoverConfig(**values["recover"]),
+            rooms=RoomConfig(**values["rooms"]) if "rooms" in values else None,
             **{name: FitConfig(**values[name]) if values[name] else None for name in ("round_fit", "last_fit")},
         )
     except (KeyError, TypeError, AttributeError) as bad:

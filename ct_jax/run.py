@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,13 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from ct_envs import Maze, MazeEnv, UserError, load_maze, maze_names, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
 from ct_envs.robots import Robot, get_robot
 from ct_jax import __version__
-from ct_jax.checkpoint import read_json, write_json
+from ct_jax.checkpoint import Checkpoints, read_json, write_json
+from ct_jax.evaluate import Episodes
 from ct_jax.presets import Settings, to_dict
+from ct_jax.progress import Bar, Metrics
 
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
 
@@ -42,7 +45,7 @@ class Run:
     robot: str
     preset: str
     settings: Settings
-    mazes: dict[str, Maze]  # trained in
+    mazes: dict[str, Maze]  # trained in; none for a robot that drives in rooms
     eval_mazes: dict[str, Maze]  # evaluated in besides them
     seed: int
     engine: str
@@ -61,14 +64,20 @@ class Run:
         return get_robot(self.robot)
 
     @property
-    def stacked(self) -> Maze:
-        """The training mazes along a leading axis."""
-        return stack_mazes(list(self.mazes.values()))
+    def stacked(self) -> Maze | None:
+        """The training mazes along a leading axis, if it has any."""
+        return stack_mazes(list(self.mazes.values())) if self.mazes else None
 
     def done(self, stage: str) -> dict[str, Any] | None:
         """What the finished stage said of itself; None if it has not finished."""
         file = self.folder / stage / "done.json"
         return read_json(file, mend=self.mend(stage)) if file.is_file() else None
+
+    @property
+    def made(self) -> dict[str, Any]:
+        """What made the run, for what is shipped of it."""
+        config = read_json(self.folder / "config.json")
+        return {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
 
     def mend(self, stage: str) -> str:
         """What to do about a damaged file of a stage."""
@@ -90,6 +99,57 @@ class Run:
             raise
         write_json(folder / "done.json", info | {"wall_s": round(before + time.perf_counter() - begun, 2)})
         file.unlink(missing_ok=True)
+
+
+# ------------------------------------------------------------------------------------------- trainings and results
+
+
+@contextmanager
+def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[dict[str, Any]]:
+    """A training's bar, metrics, and checkpoints in the folder: its ``on_progress`` and ``checkpoints``."""
+    with Bar(name, total) as bar:
+        checkpoints = Checkpoints(folder / f"checkpoints-{name}")
+
+        def on_progress(done: int, report: float | dict[str, float]) -> None:
+            values = report if isinstance(report, dict) else {"loss": report}
+            metrics.log(name, done, **values)
+            shown = next((word for word in ("success", "loss") if word in values), None)
+            bar.update(done, f"{shown} {values[shown]:.4g}" if shown else "")
+
+        yield {"on_progress": on_progress, "checkpoints": checkpoints}
+        checkpoints.close()
+
+
+def drop_checkpoints(folder: Path) -> None:
+    """Delete what only an interrupted training needs."""
+    for left in folder.glob("checkpoints-*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def kept_row(
+    folder: Path, name: str, method: str, head: dict[str, Any], measure: Callable[[], Episodes]
+) -> dict[str, Any]:
+    """A method's row of the table, with its episodes beside it in the folder; once there, read back.
+
+    Args:
+        head: what the row begins with.
+    """
+    file = folder / f"{slug(name)}-{method}.json"
+    if not file.is_file():
+        episodes = measure()
+        _save_episodes(file.with_suffix(".npz"), episodes)
+        write_json(file, head | episodes.summary())
+    return read_json(file)
+
+
+def _save_episodes(file: Path, episodes: Episodes) -> None:
+    """Write what happened, for the report's pictures."""
+    arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "steps", "returns")}
+    arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
+    more = {"asked": episodes.asked, "frontal": episodes.frontal, "grazing": episodes.grazing}
+    more |= {"world": episodes.pairs.world}
+    arrays |= {name: array for name, array in more.items() if array is not None}
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 # ----------------------------------------------------------------------------------------------------------- mazes
@@ -129,9 +189,9 @@ def maze_text(maze: Maze) -> str:
 
 
 def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The paper's training and evaluation mazes for a robot. Raises UserError for an unknown one."""
-    get_robot(robot)
-    return ("antmaze-large",), ("antmaze-large-eval",)
+    """The paper's training and evaluation mazes for a robot, if it is one for mazes. Raises UserError for an unknown
+    one."""
+    return (("antmaze-large",), ("antmaze-large-eval",)) if get_robot(robot).course == "maze" else ((), ())
 
 
 def slug(name: str) -> str:

@@ -1,7 +1,8 @@
-"""Trajectories in memory: padded arrays that can be sharded, with the local maps left out.
+"""Trajectories in memory: padded arrays that can be sharded, with the local maps of mazes left out.
 
-A map is a function of the maze and the robot's position, so it is recomputed, exactly, when a window is drawn: a
-thousand trajectories take megabytes, not gigabytes.
+The map of a maze is a function of the robot's position, so it is recomputed, exactly, when a window is drawn: a
+thousand trajectories take megabytes, not gigabytes. What a lidar showed cannot be recomputed: it is kept, eight cells
+to the byte.
 """
 
 import zipfile
@@ -17,12 +18,14 @@ from jaxtyping import Array, Float, Int, UInt8
 from ct_envs import UserError
 from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
-from ct_envs.occupancy import local_map
+from ct_envs.occupancy import MAP_CELLS, local_map
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
-
+_MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
+_MAP_BITS = 2 * MAP_CELLS**2
 
 PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
+OBSERVED = ("seen", "map_bits")  # per step, too, where they are kept
 
 
 @struct.dataclass
@@ -39,6 +42,9 @@ class Trajectories:
     goal: Float[Array, "N 2"]  # final goal [m]
     maze: Int[Array, "N"]  # index into the mazes
     length: Int[Array, "N"]
+    # What cannot be recomputed from a maze; both or neither.
+    seen: Float[Array, "N T 2"] | None = None  # vector to the final goal, as it was observed [m]
+    map_bits: UInt8[Array, "N T 157"] | None = None  # see ``pack_maps``
 
     @property
     def n(self) -> int:
@@ -54,6 +60,16 @@ class Trajectories:
     @property
     def nbytes(self) -> int:
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+
+
+def pack_maps(maps: UInt8[np.ndarray, "*b 2 k k"]) -> UInt8[np.ndarray, "*b 157"]:
+    """Local maps with eight cells to the byte."""
+    return np.packbits(maps.reshape(*maps.shape[:-3], -1), axis=-1)
+
+
+def unpack_maps(bits: UInt8[Array, "*b 157"]) -> UInt8[Array, "*b 2 k k"]:
+    """The inverse of ``pack_maps``, under jit, too."""
+    return jnp.unpackbits(bits, axis=-1, count=_MAP_BITS).reshape(*bits.shape[:-1], *_MAP_SHAPE)
 
 
 def at_goal(reward: jax.Array | np.ndarray, tolerance_m: float) -> jax.Array | np.ndarray:
@@ -76,28 +92,32 @@ def concatenate(parts: list[Trajectories]) -> Trajectories:
 def pad(trajectories: Trajectories, n: int, steps: int) -> Trajectories:
     """The same data in arrays of n trajectories (the further ones empty: never drawn) and of this many steps."""
 
-    def fit(name: str) -> np.ndarray:
-        leaf = np.asarray(getattr(trajectories, name))
-        if name in PER_STEP:
+    def fit(name: str, leaf: np.ndarray) -> np.ndarray:
+        if name in (*PER_STEP, *OBSERVED):
             leaf = leaf[:, :steps]
             leaf = np.pad(leaf, [(0, 0), (0, steps - leaf.shape[1])] + [(0, 0)] * (leaf.ndim - 2))
         return np.pad(leaf, [(0, n - leaf.shape[0])] + [(0, 0)] * (leaf.ndim - 1))
 
-    return Trajectories(**{name: fit(name) for name in Trajectories.__dataclass_fields__})
+    return Trajectories(**{name: fit(name, leaf) for name, leaf in arrays_of(trajectories).items()})
+
+
+def arrays_of(trajectories: Trajectories) -> dict[str, np.ndarray]:
+    """The arrays that are there, by name."""
+    leaves = {name: getattr(trajectories, name) for name in Trajectories.__dataclass_fields__}
+    return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
 
 def save(trajectories: Trajectories, file: Path) -> None:
     """Write to an ``.npz`` file (no pickle)."""
-    arrays = {name: np.asarray(getattr(trajectories, name)) for name in Trajectories.__dataclass_fields__}
-    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez_compressed(file, **arrays_of(trajectories))  # pyright: ignore[reportArgumentType]
 
 
 def load(file: Path) -> Trajectories:
     """Read what ``save`` wrote. Raises UserError naming the file if it is damaged."""
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as data:
-            return Trajectories(**{name: data[name] for name in Trajectories.__dataclass_fields__})
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as bad:
+            return Trajectories(**{name: data[name] for name in data.files})
+    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as bad:
         raise UserError(f"{file}: not a trajectory file ({type(bad).__name__}); collect again") from None
 
 
@@ -121,7 +141,7 @@ def sample_windows(
     key: jax.Array,
     trajectories: Trajectories,
     rtg: Float[Array, "N T"],
-    mazes: Maze,
+    mazes: Maze | None,
     *,
     batch: int,
     steps: int,
@@ -134,7 +154,7 @@ def sample_windows(
 
     Args:
         rtg: ``trajectories.rtg``, computed once.
-        mazes: stacked; ``trajectories.maze`` points into it.
+        mazes: stacked; ``trajectories.maze`` points into it. Not needed where the trajectories keep their maps.
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
@@ -150,13 +170,14 @@ def sample_windows(
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731
-    position, goal = take(trajectories.position), trajectories.goal[which]
-    maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
-    see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
+    if trajectories.map_bits is not None:
+        maps, goal = unpack_maps(take(trajectories.map_bits)), take(trajectories.seen)
+    else:
+        maps, goal = _see(trajectories, mazes, which, take(trajectories.position), map_cell_m)
     window = Window(
-        map=jax.vmap(see)(maze, position, goal),
+        map=maps,
         proprio=take(trajectories.proprio),
-        goal=goal[:, None] - position,
+        goal=goal,
         action=take(trajectories.action),
         target=take(trajectories.target),
         rtg=take(rtg),
@@ -168,6 +189,17 @@ def sample_windows(
     if symmetries is None:
         return window
     return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world)), symmetries, window)
+
+
+def _see(
+    trajectories: Trajectories, mazes: Maze | None, which: Int[Array, "B"], position: Float[Array, "B S 2"],
+    map_cell_m: float,
+) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:  # fmt: skip
+    """Local maps and vectors to the goal [m] at positions [m] in the mazes of the trajectories ``which``."""
+    goal = trajectories.goal[which]
+    maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
+    see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
+    return jax.vmap(see)(maze, position, goal), goal[:, None] - position
 
 
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:

@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from ct_jax.evaluate import wilson_of
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -60,6 +62,42 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     return [*lines, "", note]
 
 
+def room_table(results: dict[str, Any]) -> list[str]:
+    """One line for each variant and reference, its models together; then densities, levels of noise, seven pairs."""
+    names = ["model", "density", "noise", "success %", "SPL", "frontal %", "grazing %"]
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    together: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
+    for row in results["rows"] + results["density"] + results["noise"]:
+        name = row["variant"] if row["method"] == "ct" else row["method"]
+        rows = together.setdefault((name, row["density"], row["noise"]), [])
+        if row["model_seed"] not in [other["model_seed"] for other in rows]:  # the plain rooms are in every sweep
+            rows.append(row)
+    for (name, density, noise), rows in together.items():
+        spl = sum(row["spl"] for row in rows) / len(rows)
+        name = name if len(rows) == 1 else f"{name}, {len(rows)} models"
+        rates = [pooled(rows, rate) for rate in ("success", "frontal", "grazing")]
+        lines.append("| " + " | ".join([name, f"{density:g}", f"{noise:g}", rates[0], f"{spl:.2f}", *rates[1:]]) + " |")
+    lines += ["", "| model | noise | seven pairs: full | partial | failed |", "|---|---|---|---|---|"]
+    for row in results["seven"]:
+        name = f"{row['variant']}, seed {row['model_seed']}" if row["method"] == "ct" else row["method"]
+        counts = [str(row[grade]) for grade in ("full", "partial", "failed")]
+        lines.append("| " + " | ".join([name, f"{row['noise']:g}", *counts]) + " |")
+    rows = results["rows"]
+    made = [", ".join(sorted({str(row[key])[:length] for row in rows}))
+            for key, length in (("commit", None), ("hardware", None), ("created", 10))]  # fmt: skip
+    on = f"{rows[0]['worlds']} random rooms, {rows[0]['pairs']} pairs in each, of seed {rows[0]['seed']}"
+    note = f"`{results['command']}`; {on}; 95 % intervals; commit {made[0]}; {made[1]}; {made[2]}."
+    return [*lines, "", note]
+
+
+def pooled(rows: list[dict[str, Any]], name: str) -> str:
+    """A rate of all models together, in percent with its interval."""
+    n = sum(row["episodes"] for row in rows)
+    low, high = wilson_of(sum(round(row[f"{name}_rate"] * row["episodes"]) for row in rows), n)
+    rate = sum(row[f"{name}_rate"] * row["episodes"] for row in rows) / n
+    return f"{100 * rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
 def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
     """One line a figure."""
     lines = ["| what | median (min-max) | against | ratio (min-max) |", "|---|---|---|---|"]
@@ -73,13 +111,19 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", name]
 
 
+def _table(data: Any) -> list[str]:
+    if not isinstance(data, dict):
+        return benchmark_table(data)
+    return room_table(data) if "seven" in data else experiment_table(data)
+
+
 def main() -> int:
     """Rewrite README.md."""
     readme = ROOT / "README.md"
     text = readme.read_text("utf-8")
     for file in sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")]):
         data = json.loads(file.read_text("utf-8"))
-        table = experiment_table(data) if isinstance(data, dict) else benchmark_table(data)
+        table = _table(data)
         marked = re.compile(rf"(<!-- {file.stem} -->\n).*?(<!-- /{file.stem} -->)", re.DOTALL)
         if not marked.search(text):
             print(f"README.md has no place for {file.stem}", file=sys.stderr)

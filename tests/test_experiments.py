@@ -9,6 +9,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Baselines, Plan, plan_for, run_plan
+from table import room_table
+from turtlebot3 import variants_for
 
 from ct_envs import UserError
 from ct_jax.baselines.cql import CqlConfig
@@ -44,3 +46,31 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_settings, tmp_path, monkeypa
     assert all(row["episodes"] == 4 and row["seed"] == 0 and row["variant"] == "one" for row in rows)
     monkeypatch.setattr("_variants.train_cql", None)  # nothing is learned twice
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
+
+
+def test_the_turtlebots_rows_share_what_they_can():
+    known = variants_for("cpu")
+    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu", "noise"]
+    ct, bc, fct = (known[name] for name in ("ct", "bc-ct", "f-ct"))
+    assert replace(fct, rounds=0) == ct and fct.rounds == 1 and fct.recover.keep == "separate"
+    assert replace(bc, model=ct.model) == ct and not bc.model.returns
+    assert (ct.model.layers, ct.model.heads, ct.model.width, ct.model.context) == (4, 4, 128, 5)
+    assert (ct.fit.batch, ct.fit.learning_rate, ct.fit.updates, ct.fit.warmup) == (128, 1e-4, 15_000, 10_000)
+    assert list(variants_for("cpu", ("cpu",))) == ["cpu"]
+    with pytest.raises(UserError, match="no variant named 'gpu'"):
+        variants_for("cpu", ("gpu",))
+
+
+def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
+    def row(variant, seed, density, success, **more):
+        rates = {"success_rate": success, "frontal_rate": 0.0, "grazing_rate": 0.1}
+        made = {"commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00", "worlds": 20, "pairs": 25}
+        what = {"variant": variant, "method": "ct", "model_seed": seed, "density": density, "noise": 0.0, "spl": 0.5}
+        return what | rates | made | {"episodes": 500, "seed": 0} | more
+
+    rows = [row("ct", 0, 1.0, 0.9), row("ct", 1, 1.0, 1.0)]
+    seven = [row("ct", 0, 1.0, 0.9, full=60, partial=5, failed=5)]
+    sweep = [*rows, row("ct", 0, 1.5, 0.8)]
+    lines = room_table({"command": "python", "rows": rows, "density": sweep, "noise": rows, "seven": seven})
+    assert [line.split(" | ")[3] for line in lines[2:4]] == ["95.0 (93 to 96)", "80.0 (76 to 83)"]
+    assert "ct, 2 models" in lines[2] and any("| 60 | 5 | 5 |" in line for line in lines)

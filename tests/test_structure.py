@@ -10,10 +10,11 @@ ROOT = Path(__file__).parents[1]
 # Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
 ORDER = [
     *["interrupts", "checkpoint", "progress"],
-    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect", "collect_turtlebot3"],
-    *["transformer", "value", "fit", "policy", "evaluate", "finetune"],
+    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
+    *["drive", "explorer_turtlebot3", "collect_turtlebot3"],
+    *["transformer", "value", "fit", "policy", "evaluate", "finetune", "evaluate_turtlebot3", "finetune_turtlebot3"],
     *["baselines", "transfer", "presets", "model", "run"],
-    *["report", "pipeline", "cli"],
+    *["report", "mazes", "rooms", "pipeline", "cli"],
 ]
 USERS = {"experiments", "benchmarks", "tests"}  # of the packages: no package knows of them
 LEARNING = {"optax", "orbax", "flax.linen", "flax.nnx", "flax.training", "brax.training", "tensorboardX"}

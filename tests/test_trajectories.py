@@ -7,10 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ct_envs import POINT, UserError, load_maze, make_maze, random_walls, stack_mazes
+from ct_envs import POINT, ROBOTS, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_envs.frames import symmetries
 from ct_envs.occupancy import local_map
-from ct_jax.trajectories import Trajectories, concatenate, load, mirror_windows, sample_windows, save, select
+from ct_jax.trajectories import (
+    Trajectories,
+    concatenate,
+    load,
+    mirror_windows,
+    pack_maps,
+    pad,
+    sample_windows,
+    save,
+    select,
+    unpack_maps,
+)
 
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
 LENGTHS = [3, 17, 40]
@@ -20,7 +31,8 @@ GROUP = symmetries(POINT)
 
 
 def fields(data):
-    return {name: np.asarray(getattr(data, name)) for name in data.__dataclass_fields__}
+    leaves = {name: getattr(data, name) for name in data.__dataclass_fields__}
+    return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
 
 def same(a, b) -> None:
@@ -267,3 +279,55 @@ def test_without_compilation_a_window_is_the_same(toy_data):
         plain = windows(data, batch=2, steps=2)
     np.testing.assert_array_equal(plain.map, compiled.map)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), plain, compiled)
+
+
+# --------------------------------------------------------------------------------------------- maps that are kept
+
+
+@pytest.fixture
+def kept(toy_data):
+    """Makes trajectories that keep the maps and goals of their steps, which here say which step it is."""
+
+    def make(lengths):
+        data = toy_data(lengths)
+        maps = np.random.default_rng(1).integers(0, 2, (*data.reward.shape, 2, 25, 25), dtype=np.uint8)
+        return data.replace(seen=data.proprio + np.float32(0.5), map_bits=pack_maps(maps)), maps
+
+    return make
+
+
+@given(st.integers(0, 2**31 - 1))
+@settings(max_examples=5)
+def test_packed_maps_are_the_maps(seed):
+    maps = np.random.default_rng(seed).integers(0, 2, (3, 4, 2, 25, 25), dtype=np.uint8)
+    np.testing.assert_array_equal(unpack_maps(pack_maps(maps)), maps)
+
+
+def test_kept_maps_and_goals_come_back_and_need_no_maze(kept):
+    data, maps = kept(LENGTHS)
+    window = draw(jax.random.key(0), data, data.rtg, None, batch=64, steps=5, map_cell_m=CELL)
+    i, t = which_step(window, data)
+    np.testing.assert_array_equal(window.map, maps[i, t])
+    np.testing.assert_array_equal(window.goal, np.stack([i, t], -1) + np.float32(0.5))
+
+
+def test_kept_maps_survive_saving_padding_and_joining(kept, tmp_path):
+    data, _ = kept(LENGTHS)
+    save(data, tmp_path / "data.npz")
+    same(data, load(tmp_path / "data.npz"))
+    same(select(pad(data, 5, 64), np.arange(3)), concatenate([data]))
+    joined = concatenate([select(data, np.array([0])), select(data, np.array([1, 2]))])
+    same(joined, concatenate([data]))
+
+
+def test_the_turtlebot_mirrored_sees_left_and_right_change_places(kept):
+    """Its own frame: rows of the map run to the left, so they are reversed, and only what points sideways changes."""
+    data, _ = kept([30])
+    group = symmetries(ROBOTS["turtlebot3"])
+    assert len(group.world) == 2
+    window = draw(jax.random.key(0), data, data.rtg, None, batch=8, steps=5, map_cell_m=CELL)
+    mirrored = mirror_windows(jnp.ones(8, jnp.int32), group, window)
+    np.testing.assert_array_equal(mirrored.map, window.map[..., ::-1, :])
+    for name in ("proprio", "goal", "action", "target"):
+        np.testing.assert_array_equal(getattr(mirrored, name), np.asarray(getattr(window, name)) * np.float32([1, -1]))
+    same(mirror_windows(jnp.ones(8, jnp.int32), group, mirrored), window)

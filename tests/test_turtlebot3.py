@@ -26,17 +26,19 @@ from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, load_world, make_world, random_world, save_world
 from ct_jax.collect import CollectConfig
 from ct_jax.collect_turtlebot3 import (
-    TURTLEBOT3_PRM,
-    PlanDriver,
     Room,
-    collect_drives,
-    collect_wave,
+    ShortcutGuide,
+    clutter,
+    collect,
+    draw_wave,
+    drive_guided,
+    make_guide,
     make_room,
-    pack_maps,
-    unpack_maps,
 )
+from ct_jax.drive import to_trajectories
 from ct_jax.prm import NoPath, PrmConfig, build_roadmap
 from ct_jax.prm import Path as Way
+from ct_jax.trajectories import unpack_maps
 
 SEEDS = st.integers(0, 2**31 - 1)
 DT_S = 0.2
@@ -634,51 +636,79 @@ def test_ctrl_c_and_a_killed_pool_leave_no_process(tmp_path, number):
 # ------------------------------------------------------------------------------------------------------ collection
 
 SMALL = CollectConfig(trajectories=3, reset_interval=2, envs=3, horizon=400)
+PRM = PrmConfig(samples=150, connect_m=2.0, margin_m=0.08)
 
 
 @pytest.fixture(scope="module")
-def drives(pool):
-    seen = []
-    found = collect_drives(jax.random.key(0), pool, SMALL, on_progress=lambda won, of: seen.append((won, of)))
-    return found, seen
+def wave():
+    return draw_wave(jax.random.key(0), 0, SMALL, PRM, n=3)
+
+
+@pytest.fixture(scope="module")
+def drives(pool, wave):
+    return drive_guided(pool, wave, make_guide("roadmap", PRM))
 
 
 @bullet
-def test_drives_are_successes_told_as_they_were(drives):
-    found, seen = drives
-    assert len(found) == 3 and seen[-1][0] >= 3
-    for each in found:
-        after = np.concatenate([each.position[1:], each.end_world[None, :2]])
-        away = np.linalg.norm(after - each.goal_world, axis=-1)
+def test_drives_are_told_as_they_were(drives):
+    for each in drives:
+        away = np.linalg.norm(each.path[1:] - each.goal_world, axis=-1)
         assert each.success and away[-1] < 0.2 and (away[:-1] >= 0.2).all() and each.length > 10
         np.testing.assert_allclose(each.reward, -away - each.collision, atol=1e-3)
         turn = np.exp(-1j * each.yaw_rad) * ((each.goal_world - each.position) @ [1, 1j])
         np.testing.assert_allclose(each.goal @ [1, 1j], turn, atol=1e-3)
         np.testing.assert_allclose(each.proprio @ [1, 1j], turn / np.abs(turn), atol=1e-3)
         held = np.abs(each.goal).max(-1) < 0.99
-        np.testing.assert_array_equal(each.maps[held, 1].sum((1, 2)), 1)
+        np.testing.assert_array_equal(np.asarray(unpack_maps(each.map_bits))[held, 1].sum((1, 2)), 1)
         np.testing.assert_array_equal(each.action, each.target)
         assert each.map_bits.shape == (each.length, 157) and (each.learn == 1).all()
 
 
 @bullet
-def test_the_key_decides_what_is_collected(drives, pool):
-    again = collect_drives(jax.random.key(0), pool, SMALL)
-    for one, other in zip(drives[0], again, strict=True):
-        np.testing.assert_array_equal(one.position, other.position)
-        np.testing.assert_array_equal(one.map_bits, other.map_bits)
+def test_trajectories_are_the_drives(drives):
+    data = to_trajectories(drives)
+    assert data.n == 3
+    np.testing.assert_array_equal(data.length, [each.length for each in drives])
+    for i, each in enumerate(drives):
+        for name, kept in (("seen", each.goal), ("map_bits", each.map_bits), ("reward", each.reward)):
+            np.testing.assert_array_equal(getattr(data, name)[i, : each.length], kept)
+            assert not getattr(data, name)[i, each.length :].any()
+        np.testing.assert_array_equal(data.goal[i], each.goal_world)
 
 
 @bullet
-def test_a_disturbance_is_not_imitated(pool):
-    noisy = collect_wave(jax.random.key(1), pool, 0, replace(SMALL, noise=0.5, guide="shortcut"), TURTLEBOT3_PRM, n=1)[
-        0
-    ]
-    calm = collect_wave(jax.random.key(1), pool, 0, replace(SMALL, starts="maze"), TURTLEBOT3_PRM, n=1)[0]
-    np.testing.assert_array_equal(noisy.action, noisy.target)
-    driven = np.linalg.norm(np.diff(noisy.position, axis=0), axis=-1) / (0.22 * DT_S)
-    assert np.abs(driven - noisy.action[:-1, 0]).max() > 0.2
-    assert calm.success
+def test_the_key_decides_what_is_collected_and_only_successes_are(drives, pool):
+    told = []
+    data = collect(jax.random.key(0), pool, SMALL, PRM, on_progress=lambda won, of: told.append((won, of)))
+    assert told[-1][0] >= 3 and data.n == 3
+    for i, each in enumerate(drives):
+        np.testing.assert_array_equal(data.map_bits[i, : each.length], each.map_bits)
+
+
+@bullet
+@pytest.mark.parametrize(("guide", "noise"), [("shortcut", 0.5), ("explorer", 0.1)])
+def test_other_guides_arrive_too_and_a_disturbance_is_not_imitated(guide, noise, pool, wave):
+    drives = drive_guided(pool, wave, make_guide(guide, PRM), noise=noise)
+    assert all(each.success for each in drives)
+    for each in drives:
+        np.testing.assert_array_equal(each.action, each.target)
+    driven = np.linalg.norm(np.diff(drives[0].position, axis=0), axis=-1) / (0.22 * DT_S)
+    assert np.abs(driven - drives[0].action[:-1, 0]).max() > 0.4 * noise
+
+
+@given(SEEDS)
+@settings(max_examples=5)
+def test_a_shortcut_is_in_sight_and_no_detour(seed):
+    """From anywhere free, also right beside an obstacle: the straight way to the waypoint touches nothing."""
+    rng = np.random.default_rng(seed)
+    room = make_room(jax.random.key(seed % 7), PRM)
+    start, goal = room.draw(rng, "maze")
+    guide = ShortcutGuide(0.08)
+    field = guide._field(Episode(room.world, start, goal), room)
+    assert np.isfinite(field.to_go).mean() > 0.9 and field.to_go[-1] == 0
+    for position in room.world.sample_free(rng, 20, RADIUS_M + 1e-3):
+        target = guide._choose(field, position)
+        assert room.world.segment_free(position, target, RADIUS_M - 2e-3) or (target == goal).all()
 
 
 @bullet
@@ -686,22 +716,61 @@ def test_a_goal_never_reached_is_an_error_and_no_hang():
     with Turtlebot3Pool(2, processes=1, config=Turtlebot3Config(horizon=3)) as short:
         config = CollectConfig(trajectories=1, envs=2, horizon=3, give_up=3.0)
         with pytest.raises(UserError, match="reached only 0 of 4 goals"):
-            collect_drives(jax.random.key(0), short, config)
+            collect(jax.random.key(0), short, config, PRM)
         with pytest.raises(UserError, match="do not fit a pool"):
-            collect_drives(jax.random.key(0), short, replace(config, horizon=400))
-
-
-@given(SEEDS)
-@settings(max_examples=5)
-def test_packed_maps_are_the_maps(seed):
-    maps = np.random.default_rng(seed).integers(0, 2, (3, 4, 2, 25, 25), dtype=np.uint8)
-    np.testing.assert_array_equal(unpack_maps(pack_maps(maps)), maps)
+            collect(jax.random.key(0), short, replace(config, horizon=400), PRM)
 
 
 def test_rooms_and_guides():
-    one, again, dense = (make_room(jax.random.key(3), density=density) for density in (None, None, 0.2))
+    one, again, dense = (make_room(jax.random.key(3), PRM, density=density) for density in (1.0, 1.0, 2.0))
     np.testing.assert_array_equal(one.world.boxes, again.world.boxes)
     np.testing.assert_array_equal(one.roadmap.points, again.roadmap.points)
     assert dense.world.covered() > one.world.covered()
-    with pytest.raises(UserError, match="guides: roadmap, shortcut"):
-        PlanDriver(guide="explorer")
+    np.testing.assert_array_equal(clutter(5, 1.0).boxes, random_world(5).boxes)
+    with pytest.raises(UserError, match="guides: roadmap, shortcut, explorer"):
+        make_guide("luck", PRM)
+
+
+# ---------------------------------------------------------------------------------------------------------- noise
+
+
+@bullet
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_in_what_is_believed_and_not_in_the_truth(seed):
+    """The belief drifts and the ranges err, by about what the level says; what is told of the truth is the truth."""
+    world = random_world(seed)
+    start, goal = world.sample_pair(np.random.default_rng(seed), RADIUS_M)
+    actions = np.tile([0.5, 0.6], (60, 1))
+    with Turtlebot3Env(Turtlebot3Config(noise=1.0)) as noisy:
+        first, steps = run(noisy, world, start, goal, actions, seed=seed)
+        again = run(noisy, world, start, goal, actions, seed=seed)[1]
+        last = steps[-1].info
+        np.testing.assert_array_equal(last["position"], noisy.pose.position)
+        off = np.linalg.norm(last["believed"].position - last["position"])
+        assert 1e-4 < off < 0.3
+        assert 1e-4 < abs(np.angle(np.exp(1j * (last["believed"].yaw_rad - last["yaw_rad"])))) < 0.3
+        err = last["ranges"] - noisy.lidar()
+        met = np.isfinite(err) & (noisy.lidar() < 1.0)
+        assert 0 < np.isinf(last["ranges"]).mean() < 0.2 and 1e-3 < np.std(err[met]) < 0.06
+        assert steps[-1].reward == pytest.approx(-np.linalg.norm(goal - last["position"]) - last["collision"])
+        for one, other in zip(steps, again, strict=True):
+            np.testing.assert_array_equal(one.obs["map"], other.obs["map"])
+    assert np.linalg.norm(first["goal"]) == pytest.approx(np.linalg.norm(goal - start), abs=0.01)
+
+
+@bullet
+def test_a_pool_with_noise_is_its_simulations_one_by_one():
+    config = Turtlebot3Config(noise=1.0)
+    with Turtlebot3Pool(3, processes=1, config=config) as noisy, Turtlebot3Env(config) as alone:
+        frames = play(noisy, script())
+        for slot, task in enumerate(tasks()):
+            first, steps = run(alone, task.world, task.start, task.goal, script()[:, slot], seed=task.seed)
+            np.testing.assert_array_equal(frames[0].map[slot], first["map"])
+            np.testing.assert_array_equal(frames[-1].goal[slot], steps[-1].obs["goal"])
+            np.testing.assert_array_equal(frames[-1].believed_position[slot], steps[-1].info["believed"].position)
+
+
+@pytest.mark.parametrize("level", [-0.1, 9.0, float("nan")])
+def test_a_noise_level_out_of_range_is_one_line(level):
+    with pytest.raises(UserError, match="noise level"):
+        Turtlebot3Config(noise=level)

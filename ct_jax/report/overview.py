@@ -200,7 +200,7 @@ def _curves(run: Run) -> list[Block]:
 
 def _last_row(run: Run) -> list[Block]:
     """Calibration on the left, timing on the right."""
-    asked = [e for e in run.episodes if e.asked is not None and e.returns is not None]
+    asked = [e for e in run.tested if e.asked is not None and e.returns is not None]
     asked = sorted(asked, key=lambda e: (e.method != words.main_method(run), e.seen))[:1]
     times = [(s, t) for s, done in run.done.items() if (t := number(done.get("wall_s"))) is not None]
     if not asked and not times:

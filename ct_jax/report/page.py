@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ct_envs.turtlebot3_world import World
 from ct_jax import __version__
 from ct_jax.report import pictures, words
 from ct_jax.report.pictures import LIGHT
@@ -31,6 +32,8 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
     ("SPL", "spl", "spl_ci95", words.decimal),
     ("Scaled return", "return_scaled", "return_scaled_ci95", lambda x: words.decimal(x, 1)),
     ("Collisions", "collision_rate", "collision_ci95", words.percent),
+    ("Frontal", "frontal_rate", "frontal_ci95", words.percent),
+    ("Grazing", "grazing_rate", "grazing_ci95", words.percent),
     ("Falls", "fall_rate", "fall_ci95", words.percent),
     ("Time-outs", "timeout_rate", "timeout_ci95", words.percent),
     ("Mean steps", "steps_mean", "steps_ci95", lambda x: words.decimal(x, 0)),
@@ -39,7 +42,9 @@ _GLOSSARY = {
     "Success": "share of episodes that reached the goal in time; small figures are 95 % intervals",
     "SPL": "success weighted by path length: 1 is the shortest way, always",
     "Scaled return": "minus the distance to the goal, summed over all steps, over 100; nearer to 0 is better",
-    "Collisions": "share of episodes in which the robot touched a wall at least once",
+    "Collisions": "share of episodes in which the robot touched something at least once",
+    "Frontal": "share of episodes in which it ran into something ahead of it",
+    "Grazing": "share of episodes in which it touched something with its side",
     "Falls": "share of episodes that ended with the robot on its side or back",
     "Time-outs": "share of episodes that did not reach the goal in time",
 }
@@ -154,8 +159,16 @@ def _results(run: Run) -> str:
     tables = [_table(run, maze, [row for row in run.rows if row["maze"] == maze]) for maze in mazes]
     lead = f'<p class="lead">{_text(words.verdict(run))}</p>'
     methods = {words.METHOD_LABELS[m]: words.METHOD_NOTES[m] for m in METHODS if m in {r["method"] for r in run.rows}}
-    terms = "".join(f"<li><b>{_text(k)}</b>: {_text(v)}.</li>" for k, v in (methods | _GLOSSARY).items())
+    shown = {name for name, *_ in _columns(run)}
+    terms = methods | {name: text for name, text in _GLOSSARY.items() if name in shown}
+    terms = "".join(f"<li><b>{_text(k)}</b>: {_text(v)}.</li>" for k, v in terms.items())
     return _section(title, lead, _grid(tables, "results"), f'<ul class="glossary">{terms}</ul>')
+
+
+def _columns(run: Run) -> list[tuple[str, str, str, Callable[[float], str]]]:
+    """The columns of the tables: contacts are told apart for some robots only."""
+    told = [name for name in ("frontal_rate", "grazing_rate") if any(name in row for row in run.rows)]
+    return [column for column in _COLUMNS if column[1] not in ("frontal_rate", "grazing_rate") or column[1] in told]
 
 
 def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:
@@ -163,7 +176,7 @@ def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:
     seeds = {str(row.get("seed")) for row in rows}
     episodes = {int(n) for row in rows if (n := number(row.get("episodes"))) is not None}
     pairs = words.count(min(episodes), "start-goal pair") if len(episodes) == 1 else ""
-    head = "".join(f'<th scope="col">{name}</th>' for name, *_ in _COLUMNS)
+    head = "".join(f'<th scope="col">{name}</th>' for name, *_ in _columns(run))
     body = "".join(_row(run, row, several=len(seeds) > 1) for row in rows)
     seen = bool(rows[0].get("seen"))
     caption = f'<b>{_text(maze)}</b>{_seen_tag(seen)} <span class="quiet">{pairs}</span>'
@@ -174,9 +187,9 @@ def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:
 def _row(run: Run, row: dict[str, Any], *, several: bool) -> str:
     """One method in one maze, its name above its figures. With ``several`` seeds, it says which."""
     label = words.method_label(row["method"]) + (f" (seed {row.get('seed')})" if several else "")
-    cells = "".join(_cell(row, name, key, interval, show) for name, key, interval, show in _COLUMNS)
+    cells = "".join(_cell(row, name, key, interval, show) for name, key, interval, show in _columns(run))
     first = ' class="first"' if row["method"] == words.main_method(run) else ""
-    name = f'<th scope="rowgroup" colspan="{len(_COLUMNS)}">{_text(label)}</th>'
+    name = f'<th scope="rowgroup" colspan="{len(_columns(run))}">{_text(label)}</th>'
     return f"<tbody{first}><tr>{name}</tr><tr>{cells}</tr></tbody>"
 
 
@@ -198,27 +211,28 @@ def _cell(row: dict[str, Any], name: str, key: str, interval: str, show: Callabl
 
 
 def _mazes(run: Run) -> str:
-    title = "The mazes"
+    rooms = any(isinstance(place, World) for place in run.walls.values())
+    title = "The rooms" if rooms else "The mazes"
     if not run.walls:
         return _section(title, _missing("No mazes", "config.json"))
     figures = []
     for name, walls in list(run.walls.items())[:MOST_MAZES]:
         figure, ax = pictures.maze_figure(walls)
         pictures.draw_maze(ax, walls, run.cell_m)
-        height, width = (side * run.cell_m for side in walls.shape)
-        note, size = "", f"{width:g} x {height:g} m"
+        note, size = "", words.size(walls, run.cell_m)
         if not figures and run.roadmap:
             points, edges = run.roadmap
             pictures.draw_roadmap(ax, points, edges)
             parts = words.count(len(points), "point"), words.count(len(edges), "edge")
             note = " with a roadmap of {} and {}".format(*parts)
-        svg = pictures.to_svg(figure, f"Maze {name}, {size}{note}.")
+        svg = pictures.to_svg(figure, f"{'' if rooms else 'Maze '}{name}, {size}{note}.")
         figures.append(_figure(svg, name, size + note, _seen_tag(run.seen.get(name, False))))
     lead = "The planner knows these maps. The transformer never sees one: only the walls around it."
     lead = f'<p class="quiet">{lead}</p>'
     more = len(run.walls) - len(figures)
-    rest = f'<p class="quiet">{words.count(more, "further maze")} not drawn.</p>' if more else ""
-    missing = "" if run.roadmap else _missing("No roadmap", "prm/roadmap.npz")
+    rest = f'<p class="quiet">{words.count(more, "further " + ("room" if rooms else "maze"))} not drawn.</p>'
+    rest = rest if more else ""
+    missing = "" if run.roadmap or rooms else _missing("No roadmap", "prm/roadmap.npz")
     return _section(title, lead, _grid(figures, "wide"), rest, missing)
 
 
@@ -229,7 +243,10 @@ def _trajectories(run: Run) -> str:
         return _section(title, _missing("No trajectories", "evaluate/*.npz"))
     parts = [_key()]
     for method in dict.fromkeys(episodes.method for episodes in drawn):
-        figures = [_paths_figure(run, e, MOST_POINTS // len(drawn)) for e in drawn if e.method == method]
+        mine = [e for e in drawn if e.method == method]
+        if len(mine) > MOST_MAZES:  # those with the most failures
+            mine = sorted(mine, key=lambda e: int(e.success.sum()) - len(e.success))[:MOST_MAZES]
+        figures = [_paths_figure(run, e, MOST_POINTS // len(drawn)) for e in mine]
         parts.append(f"<h3>{_text(words.method_label(method))}</h3>{_grid(figures, 'wide')}")
     return _section(title, *parts)
 
@@ -385,7 +402,7 @@ def _curves(run: Run) -> str:
 def _calibration(run: Run) -> str:
     title = "Return asked for, return got"
     figures = []
-    for episodes in run.episodes:
+    for episodes in run.tested:
         if episodes.asked is None or episodes.returns is None:
             continue
         figure, ax = pictures.plot_figure(3.9, 3.5)

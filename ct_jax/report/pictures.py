@@ -18,9 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.patches import Circle, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, StrMethodFormatter
+
+from ct_envs.turtlebot3_world import World
+from ct_jax.report.reading import Place
 
 LEVELS = 8  # steps of the time ramps
 LIGHT = {
@@ -108,20 +111,25 @@ def _font_size(hit: re.Match[str]) -> str:
 # -------------------------------------------------------------------------------------------- mazes and paths
 
 
-def maze_figure(walls: Bool[np.ndarray, "H W"], width_in: float = 5.2) -> tuple[Figure, Axes]:
-    """A figure that a maze of this shape fills, and its axes."""
+def maze_figure(walls: Place, width_in: float = 5.2) -> tuple[Figure, Axes]:
+    """A figure that a maze of this shape, or a room, fills, and its axes."""
     figure = Figure(figsize=(width_in, width_in * float(np.clip(aspect(walls), 0.15, 1.6))))
     return figure, figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
 
-def aspect(walls: Bool[np.ndarray, "H W"]) -> float:
-    """Height over width of a maze as it is drawn."""
+def aspect(walls: Place) -> float:
+    """Height over width of a maze or a room as it is drawn."""
+    if isinstance(walls, World):
+        return 1.0
     height, width = (side - 2 * _HIDDEN for side in walls.shape)
     return height / width
 
 
-def draw_maze(ax: Axes, walls: Bool[np.ndarray, "H W"], cell_m: float = 4.0) -> None:
-    """Draw a maze, row 0 lowest, in metres, and set the axes to it without ticks or frame."""
+def draw_maze(ax: Axes, walls: Place, cell_m: float = 4.0) -> None:
+    """Draw a maze, row 0 lowest, or a room, in metres, and set the axes to it without ticks or frame."""
+    if isinstance(walls, World):
+        _draw_room(ax, walls)
+        return
     walls = np.asarray(walls, bool)
     height, width = walls.shape
     extent = (0.0, width * cell_m, 0.0, height * cell_m)
@@ -136,6 +144,25 @@ def draw_maze(ax: Axes, walls: Bool[np.ndarray, "H W"], cell_m: float = 4.0) -> 
         ax.imshow(grey, extent=extent, origin="lower", interpolation="nearest", zorder=1)
     ax.set_xlim(_HIDDEN * cell_m, (width - _HIDDEN) * cell_m)
     ax.set_ylim(_HIDDEN * cell_m, (height - _HIDDEN) * cell_m)
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+
+
+def _draw_room(ax: Axes, room: World) -> None:
+    """Draw a room's walls and obstacles."""
+    frame = {"facecolor": LIGHT["floor"], "edgecolor": LIGHT["wall"], "linewidth": 2.5, "zorder": 0}
+    ax.add_patch(Rectangle((0, 0), room.side_m, room.side_m, **frame))
+    solid = {"facecolor": LIGHT["wall"], "edgecolor": LIGHT["wall"], "linewidth": 0.5, "zorder": 1}
+    for x, y, half_x, half_y, yaw in room.boxes:
+        box = Rectangle(
+            (x - half_x, y - half_y), 2 * half_x, 2 * half_y, angle=np.degrees(yaw), rotation_point="center", **solid
+        )
+        ax.add_patch(box)
+    for x, y, radius in room.cylinders:
+        ax.add_patch(Circle((x, y), radius, **solid))
+    border = 0.02 * room.side_m
+    ax.set_xlim(-border, room.side_m + border)
+    ax.set_ylim(-border, room.side_m + border)
     ax.set_aspect("equal")
     ax.set_axis_off()
 

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,14 @@ from jaxtyping import Bool, Float, Int
 
 from ct_envs.errors import UserError
 from ct_envs.maze import CELL_M, parse_walls
+from ct_envs.turtlebot3_world import World, make_world
 
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate")
 METHODS = ("ct", "planner", "explorer")  # the order they are shown in; others follow
+ROOMS = "rooms"  # all rooms of an evaluation together, as its files call them
+_ROOM_CELL_M = 0.5  # in rooms, what counts as one spot [m]
+
+Place = np.ndarray | World  # the walls of a maze [H, W], or a room
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,7 @@ class Episodes:
     goal: Float[np.ndarray, "n 2"]
     returns: Float[np.ndarray, "n"] | None
     asked: Float[np.ndarray, "n"] | None  # return asked for at the start
+    room: Int[np.ndarray, "n"] | None = None  # number of the room of each episode
 
 
 @dataclass(frozen=True)
@@ -51,10 +57,11 @@ class Run:
     folder: Path
     config: dict[str, Any]
     cell_m: float
-    walls: dict[str, Bool[np.ndarray, "H W"]]  # the training mazes first
+    walls: dict[str, Place]  # mazes, the training ones first, or rooms
     seen: dict[str, bool]
     rows: list[dict[str, Any]]  # of evaluate/results.json, seen mazes first, methods in order
-    episodes: list[Episodes]  # likewise
+    tested: list[Episodes]  # likewise
+    episodes: list[Episodes]  # the same, but for rooms, each of which is by itself
     curves: dict[str, dict[str, Curve]]  # by stage and name
     horizon: int  # steps of the longest episode: when time runs out
     roadmap: tuple[np.ndarray, np.ndarray] | None  # points [n, 2] (m), edges [m, 2]
@@ -69,19 +76,24 @@ def read_run(folder: Path) -> Run:
     """
     config = _read_config(folder)
     seen_mazes, unseen_mazes = _texts(config.get("mazes")), _texts(config.get("eval_mazes"))
-    walls = dict(_walls(seen_mazes | unseen_mazes))
+    walls: dict[str, Place] = dict(_walls(seen_mazes | unseen_mazes))
+    rooms = _read_rooms(folder / "evaluate" / "rooms.json")
+    walls |= rooms
     seen = dict.fromkeys(unseen_mazes, False) | dict.fromkeys(seen_mazes, True)
     rows = _read_rows(folder / "evaluate" / "results.json")
     seen = {row["maze"]: bool(row.get("seen")) for row in rows} | seen
     cell_m = number(config.get("cell_m"))
-    episodes = list(_read_episodes(folder / "evaluate", rows, seen))
+    tested = list(_read_episodes(folder / "evaluate", rows, seen))
+    episodes = [part for each in tested for part in (_by_room(each, list(rooms)) if each.maze == ROOMS else [each])]
+    seen |= dict.fromkeys(rooms, False)
     return Run(
         folder=folder,
         config=config,
-        cell_m=cell_m if cell_m and cell_m > 0 else CELL_M,
+        cell_m=_ROOM_CELL_M if rooms else cell_m if cell_m and cell_m > 0 else CELL_M,
         walls=walls,
         seen=seen,
         rows=rows,
+        tested=tested,
         episodes=episodes,
         horizon=max((int(e.steps.max()) for e in episodes), default=0),
         curves=_read_curves(folder / "metrics.jsonl"),
@@ -132,6 +144,18 @@ def _walls(texts: dict[str, str]) -> Iterator[tuple[str, np.ndarray]]:
             yield name, parse_walls(text, source="maze")
         except UserError:
             continue
+
+
+def _read_rooms(path: Path) -> dict[str, Place]:
+    """The rooms of an evaluation, by name."""
+    found = read_json(path)
+    rooms: dict[str, Place] = {}
+    try:
+        for number, room in enumerate(found["rooms"] if isinstance(found, dict) else []):
+            rooms[f"room {number + 1}"] = make_world(room["boxes"], room["cylinders"], side_m=room["side_m"])
+    except (UserError, KeyError, TypeError, ValueError):
+        return {}
+    return rooms
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:
@@ -192,7 +216,23 @@ def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, boo
             goal=arrays["goal"],
             returns=_optional(arrays, "returns", n),
             asked=_optional(arrays, "asked", n),
+            room=None if (room := _optional(arrays, "world", n)) is None else room.astype(int),
         )
+
+
+def _by_room(episodes: Episodes, names: list[str]) -> Iterator[Episodes]:
+    """The episodes of each room by themselves."""
+    if episodes.room is None:
+        return
+    for number, name in enumerate(names):
+        mine = episodes.room == number
+        if mine.any():
+            parts = {
+                field: value[mine]
+                for field in ("success", "collided", "steps", "start", "goal", "returns", "asked")
+                if (value := getattr(episodes, field)) is not None
+            }
+            yield replace(episodes, maze=name, path=episodes.path[:, mine], **parts)
 
 
 def _optional(arrays: dict[str, np.ndarray], name: str, n: int) -> np.ndarray | None:

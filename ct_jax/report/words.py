@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ct_envs.turtlebot3_world import World
 from ct_jax.report.pictures import track
-from ct_jax.report.reading import Episodes, Run, number
+from ct_jax.report.reading import Episodes, Place, Run, number
 
 METHOD_LABELS = {"ct": "Control Transformer", "planner": "Planner with the full map", "explorer": "Explorer"}
 METHOD_NOTES = {
@@ -26,6 +27,8 @@ KINDS = {  # how a failed episode went, for a single one and as the end of a sen
     "late": ("ran out of time on the way", "was still on its way when time ran out"),
     "early": ("broke off early", "broke off before time was up, by a fall or a fault"),
 }
+_SEEN = ("in the maze it was trained in", "in the mazes it was trained in")
+_UNSEEN = ("in a maze it had never seen", "in mazes it had never seen")
 MINUS, DASH, NARROW = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{NARROW NO-BREAK SPACE}"
 
 
@@ -78,11 +81,12 @@ def main_method(run: Run) -> str:
 def headline(run: Run) -> str:
     """The title of a report: its most telling number."""
     rows = [row for row in run.rows if row["method"] == main_method(run)]
-    for seen, place in ((False, "never seen before"), (True, "it was trained in")):
+    for seen, where_to in ((False, "never seen before"), (True, "it was trained in")):
         reached, tried = _tally(row for row in rows if bool(row.get("seen")) == seen)
         mazes = len({row["maze"] for row in rows if bool(row.get("seen")) == seen})
         if tried:
-            where = f"{'a maze' if mazes == 1 else 'mazes'} {place}"
+            one, many = ("rooms", "rooms") if in_rooms(rows) else ("a maze", "mazes")
+            where = f"{one if mazes == 1 else many} {where_to}"
             return f"{percent(reached / tried)} of goals reached in {where}"
     return f"A {run.config.get('robot', 'robot')} on its way: no results yet"
 
@@ -92,9 +96,10 @@ def verdict(run: Run) -> str:
     method = main_method(run)
     rows = [row for row in run.rows if row["method"] == method]
     parts = []
+    unseen = ("in rooms it had never seen",) * 2 if in_rooms(rows) else _UNSEEN
     for seen, one, many in (
         (True, "in the maze it was trained in", "in the mazes it was trained in"),
-        (False, "in a maze it had never seen", "in mazes it had never seen"),
+        (False, *unseen),
     ):
         there = [row for row in rows if bool(row.get("seen")) == seen]
         reached, tried = _tally(there)
@@ -104,6 +109,20 @@ def verdict(run: Run) -> str:
     if not parts:
         return ""
     return f"The {method_label(method)} reached {' and '.join(parts)}; {_failing(run, rows)}."
+
+
+def in_rooms(rows: Iterable[dict[str, Any]]) -> bool:
+    """Whether results are of rooms, not of mazes."""
+    return any("worlds" in row for row in rows)
+
+
+def size(place: Place, cell_m: float) -> str:
+    """How large a maze or a room is, and how much stands in it."""
+    if isinstance(place, World):
+        obstacles = count(len(place.boxes) + len(place.cylinders), "obstacle")
+        return f"{place.side_m:g} x {place.side_m:g} m, {obstacles} on {percent(place.covered())} of the floor"
+    height, width = (side * cell_m for side in place.shape)
+    return f"{width:g} x {height:g} m"
 
 
 def _tally(rows: Iterable[dict[str, Any]]) -> tuple[int, int]:

@@ -92,7 +92,13 @@ def _blocks(*blocks: np.ndarray) -> np.ndarray:
     return whole
 
 
-_GENERATORS = {"point": _point, "ant": _ant}
+def _turtlebot3() -> list[tuple[np.ndarray, ...]]:
+    """Left and right change places: of the goal's direction (cos, sin) and of the action (v, omega)."""
+    flip_y = np.diag([1.0, -1.0])
+    return [(flip_y, flip_y, flip_y)]
+
+
+_GENERATORS = {"point": _point, "ant": _ant, "turtlebot3": _turtlebot3}
 
 
 def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:

@@ -72,7 +72,7 @@ class MazeEnv(Env):
         """
         if maze is not None and not np.allclose(maze.cell_m, cell_m):
             raise UserError(f"the maze's cells are not {cell_m} m wide; give MazeEnv the maze's own cell_m")
-        self.robot = get_robot(robot) if isinstance(robot, str) else robot
+        self.robot = get_robot(robot, "maze") if isinstance(robot, str) else robot
         self.engine = make_engine(engine, self.robot, cell_m=cell_m)
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
         self.horizon = horizon or self.robot.horizon

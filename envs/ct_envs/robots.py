@@ -23,6 +23,7 @@ class Robot:
     upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
     controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-F)
     has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
+    course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
 
 
 POINT = Robot(
@@ -50,13 +51,27 @@ ANT = Robot(
     controller_reward="distance",
 )
 
-ROBOTS = {robot.name: robot for robot in (POINT, ANT)}
+TURTLEBOT3 = Robot(
+    name="turtlebot3",
+    xml="turtlebot3_burger.urdf",
+    radius_m=0.105,
+    touch_m=0.105,
+    top_speed_mps=0.22,
+    control_dt_s=0.2,
+    horizon=400,  # 80 s, in which the robot drives 17 m
+    goal_tolerance_m=0.2,
+    course="room",
+)
+
+ROBOTS = {robot.name: robot for robot in (POINT, ANT, TURTLEBOT3)}
 
 
-def get_robot(name: str) -> Robot:
-    """The robot of that name. Raises UserError with the valid names."""
-    if name not in ROBOTS:
-        raise UserError(f"no robot named '{name}'; robots: {', '.join(ROBOTS)}")
+def get_robot(name: str, course: str | None = None) -> Robot:
+    """The robot of that name. Raises UserError with the valid names, those of a ``course`` if one is given."""
+    known = [robot.name for robot in ROBOTS.values() if course in (None, robot.course)]
+    if name not in known:
+        where = f" for a {course}" if course else ""
+        raise UserError(f"no robot named '{name}'{where}; robots: {', '.join(known)}")
     return ROBOTS[name]
 
 

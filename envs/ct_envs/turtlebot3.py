@@ -26,15 +26,21 @@ from jaxtyping import Float
 
 from ct_envs.errors import UserError
 from ct_envs.lidar import LIDAR_BEAMS, LIDAR_RANGE_M, lidar_map
+from ct_envs.robots import TURTLEBOT3
+from ct_envs.turtlebot3_noise import Belief
 from ct_envs.turtlebot3_world import World
 
 WHEEL_RADIUS_M = 0.033  # r
 WHEEL_SEPARATION_M = 0.160  # b
-RADIUS_M = 0.105  # of the body
-TOP_SPEED_MPS = 0.22
+RADIUS_M = TURTLEBOT3.radius_m
+TOP_SPEED_MPS = TURTLEBOT3.top_speed_mps
 TOP_TURN_RADPS = 2.84
+PROPRIO_SIZE = 2  # cos dpsi, sin dpsi
+ACTION_SIZE = 2  # v, omega
 FRAMES = ("heading", "world")
+MAX_NOISE = 5.0
 
+_STOP_M = 0.05  # with noise, a robot that believes to be so near to its goal stops there
 _LIDAR_M = 0.18  # height of the beams: above the body, below the top of every obstacle
 _HEIGHT_M = 0.5  # of walls and obstacles
 _TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
@@ -49,19 +55,22 @@ _RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
 class Turtlebot3Config:
     """The simulation and the task."""
 
-    control_dt_s: float = 0.2  # between two actions
+    control_dt_s: float = TURTLEBOT3.control_dt_s  # between two actions
     physics_dt_s: float = 1 / 240  # between two steps of PyBullet
-    horizon: int = 400  # control steps of an episode: 80 s, in which the robot drives 17 m
-    goal_tolerance_m: float = 0.2
+    horizon: int = TURTLEBOT3.horizon  # control steps of an episode
+    goal_tolerance_m: float = TURTLEBOT3.goal_tolerance_m
     collision_penalty: float = 1.0  # taken off the reward of a step in which the robot touches something
     frame: str = "heading"  # of map and goal: the robot's "heading" or the "world"
     urdf: str | None = None  # a URDF file instead of ours
+    noise: float = 0.0  # level of what a real robot gets wrong, see ``turtlebot3_noise``; 1 is meant to be real
 
     def __post_init__(self):
         if self.frame not in FRAMES:
             raise UserError(f"no frame named '{self.frame}'; frames: {', '.join(FRAMES)}")
         if not 0 < self.physics_dt_s <= self.control_dt_s:
             raise UserError(f"physics_dt_s is {self.physics_dt_s}; use more than 0 and at most control_dt_s")
+        if not 0 <= self.noise <= MAX_NOISE:
+            raise UserError(f"noise level {self.noise}; use 0 to {MAX_NOISE}, 1 is that of a real robot")
 
     @property
     def substeps(self) -> int:
@@ -142,9 +151,10 @@ class Turtlebot3Env:
 
     Action: [-1, 1]^2, shares of 0.22 m/s and 2.84 rad/s. Observation: see ``observe``. An episode ends with success
     (within the goal tolerance) or, as truncation, at the horizon; a collision does not end it. ``info`` holds
-    ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``
-    and ``ranges``. The same world, start, goal, seed and actions give the same episode, bit for bit, whatever was
-    simulated before.
+    ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``,
+    ``ranges`` and ``believed``. With ``noise``, observations, ``ranges`` and the pose ``believed`` are what the robot
+    has, all else is the truth, and an episode also ends where the robot believes to have arrived. The same world,
+    start, goal, seed and actions give the same episode, bit for bit, whatever was simulated before.
     """
 
     def __init__(self, config: Turtlebot3Config = Turtlebot3Config()):
@@ -185,7 +195,10 @@ class Turtlebot3Env:
             yaw_rad = float(np.random.default_rng(seed).uniform(-np.pi, np.pi))
         self._world, self._goal, self._steps, self._done = world, goal, 0, False
         self._build(world, start, yaw_rad)
-        return observe(self.pose, goal, self.lidar(), frame=self.config.frame)
+        self._asked = np.zeros(2)
+        self._belief = Belief(self.config.noise, *self.pose, seed)
+        obs, self._sight = self._see()
+        return obs
 
     def step(self, action: Any) -> Step:
         """One control step. Raises UserError for an action that is not two finite numbers, or after the end."""
@@ -196,19 +209,35 @@ class Turtlebot3Env:
             raise UserError("the Turtlebot3's episode is over, or none has begun; call reset first")
         touch = self._drive(*speeds(action))
         self._steps += 1
-        pose, ranges = self.pose, self.lidar()
+        pose = self.pose
+        obs, self._sight = self._see()
         distance = float(np.linalg.norm(self._goal - pose.position))
         collision = touch.frontal or touch.grazing
         success = distance < self.config.goal_tolerance_m
         truncation = not success and self._steps >= self.config.horizon
-        self._done = success or truncation
+        stopped = bool(self.config.noise) and float(np.linalg.norm(obs["goal"])) < _STOP_M
+        self._done = success or truncation or stopped
         info = {
             "success": success, "collision": collision, "frontal": touch.frontal, "grazing": touch.grazing,
             "truncation": truncation, "episode_steps": self._steps, "position": pose.position,
-            "yaw_rad": pose.yaw_rad, "ranges": ranges,
+            "yaw_rad": pose.yaw_rad, **self._sight,
         }  # fmt: skip
-        obs = observe(pose, self._goal, ranges, frame=self.config.frame)
         return Step(obs, -distance - self.config.collision_penalty * collision, self._done, info)
+
+    def _see(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """The observation, and what it was made of."""
+        if not self.config.noise:
+            pose, ranges = self.pose, self.lidar()
+        else:
+            pose = Pose(self._belief.position, self._belief.yaw_rad)
+            ranges = self._belief.scan(self.lidar())
+        obs = observe(pose, self._goal, ranges, frame=self.config.frame, missing_ok=bool(self.config.noise))
+        return obs, {"ranges": ranges, "believed": pose}
+
+    def sight(self) -> dict[str, Any]:
+        """``info`` as far as it is known before the first step."""
+        pose = self.pose
+        return {"position": pose.position, "yaw_rad": pose.yaw_rad, **self._sight}
 
     @property
     def pose(self) -> Pose:
@@ -276,27 +305,43 @@ class Turtlebot3Env:
             p.setCollisionFilterGroupMask(self._robot, link, *group, **client)
         self._command(0.0, 0.0)
 
-    def _command(self, v_mps: float, omega_radps: float) -> None:
+    def _command(self, v_mps: float, omega_radps: float, roll: Any = 1.0) -> None:
+        """Turn the wheels; ``roll`` is how much faster than asked for each of them carries the robot."""
         p = self._bullet
+        speeds = (wheel_speeds(v_mps, omega_radps) * roll).tolist()
         p.setJointMotorControlArray(
-            self._robot, self._wheels, p.VELOCITY_CONTROL, targetVelocities=wheel_speeds(v_mps, omega_radps).tolist(),
-            forces=[_TORQUE_NM] * 2, physicsClientId=self._client,
+            self._robot, self._wheels, p.VELOCITY_CONTROL, targetVelocities=speeds, forces=[_TORQUE_NM] * 2,
+            physicsClientId=self._client,
         )  # fmt: skip
 
     def _drive(self, v_mps: float, omega_radps: float) -> Touch:
         """Hold the wheels' speeds for a control step, and tell what was touched."""
-        self._command(v_mps, omega_radps)
         assert self._world is not None
+        before, asked = self._odometry(), np.array([v_mps, omega_radps])
+        roll = self._belief.roll() if self.config.noise else np.ones(2)
+        late = round(min(self._belief.latency_s, self.config.control_dt_s) / self.config.physics_dt_s)
+        self._command(*(self._asked if late else asked), roll=roll)
         # How far the robot could come: where nothing is that near, nobody need look for contacts.
         reach = RADIUS_M + 1.5 * TOP_SPEED_MPS * self.config.control_dt_s + 0.02
         near = float(self._world.clearance(self.pose.position)) < reach
         frontal = grazing = False
-        for _ in range(self.config.substeps):
+        for substep in range(self.config.substeps):
+            if substep == late and late:
+                self._command(*asked, roll=roll)
             self._bullet.stepSimulation(physicsClientId=self._client)
             if near:
                 now = self._touching(np.sign(v_mps) or 1.0)
                 frontal, grazing = frontal or now.frontal, grazing or now.grazing
+        self._asked = asked
+        if self.config.noise:
+            rolled, yaw = (after - here for after, here in zip(self._odometry(), before, strict=True))
+            self._belief.move(rolled, float(np.angle(np.exp(1j * yaw))), self.config.control_dt_s)
         return Touch(frontal, grazing)
+
+    def _odometry(self) -> tuple[np.ndarray, float]:
+        """What the wheels have rolled so far [2] (m), and the yaw [rad]."""
+        states = self._bullet.getJointStates(self._robot, self._wheels, physicsClientId=self._client)
+        return WHEEL_RADIUS_M * np.array([state[0] for state in states]), self.pose.yaw_rad
 
     def _touching(self, direction: float) -> Touch:
         """Contacts of the body now, by their normals; ``direction`` is -1 where the robot drives backwards."""
@@ -359,7 +404,7 @@ def _quiet() -> Iterator[None]:
 
 def _urdf_file(name: str | None) -> Path:
     """The URDF, looked through. Raises UserError where it is missing, or lacks the wheels."""
-    path = Path(name or str(resources.files("ct_envs") / "assets" / "turtlebot3_burger.urdf"))
+    path = Path(name or str(resources.files("ct_envs") / "assets" / TURTLEBOT3.xml))
     if not path.is_file():
         raise UserError(f"no URDF file '{path}'; leave urdf out to use the Turtlebot3's own")
     try:

@@ -47,6 +47,8 @@ class Frame(NamedTuple):
     goal: np.ndarray  # float32 [2]: vector to the goal [m]
     position: np.ndarray  # float64 [2], in the world [m]
     yaw_rad: np.ndarray  # float64
+    believed_position: np.ndarray  # float64 [2], where the robot believes to be; the truth, without noise [m]
+    believed_yaw_rad: np.ndarray  # float64
     ranges: np.ndarray  # float32 [360], [m]
     reward: np.ndarray  # float32
     done: np.ndarray  # bool, as all that follow
@@ -58,7 +60,8 @@ class Frame(NamedTuple):
 
 _EMPTY = Frame(
     np.zeros((2, MAP_CELLS, MAP_CELLS), np.uint8), np.zeros(2, np.float32), np.zeros(2, np.float32), np.zeros(2),
-    np.zeros(()), np.zeros(LIDAR_BEAMS, np.float32), np.zeros((), np.float32), np.ones((), bool),
+    np.zeros(()), np.zeros(2), np.zeros(()), np.zeros(LIDAR_BEAMS, np.float32), np.zeros((), np.float32),
+    np.ones((), bool),
     *[np.zeros((), bool)] * 4,
 )  # fmt: skip
 
@@ -252,8 +255,7 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
             envs[slot] = Turtlebot3Env(config)
         env = envs[slot]
         obs = env.reset(episode.world, episode.start, episode.goal, seed=episode.seed, yaw_rad=episode.yaw_rad)
-        info = {"position": env.pose.position, "yaw_rad": env.pose.yaw_rad, "ranges": env.lidar()}
-        frames[slot] = _frame(obs, 0.0, False, info)
+        frames[slot] = _frame(obs, 0.0, False, env.sight())
     return frames
 
 
@@ -278,5 +280,6 @@ def _frame(obs: dict[str, np.ndarray], reward: float, done: bool, info: dict[str
     flags = [np.asarray(info.get(name, False)) for name in ("success", "collision", "frontal", "grazing")]
     return Frame(
         obs["map"], obs["proprio"], obs["goal"], info["position"], np.asarray(info["yaw_rad"]),
+        info["believed"].position, np.asarray(info["believed"].yaw_rad),
         info["ranges"].astype(np.float32), np.float32(reward), np.asarray(done), *flags,
     )  # fmt: skip

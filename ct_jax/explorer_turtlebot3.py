@@ -1,0 +1,145 @@
+"""The Turtlebot3's explorer: what a user would otherwise pick, with the transformer's own information and odometry.
+
+It marks on a grid where its beams ended, takes all else for free, and heads along the shortest way on that grid.
+It plans in its own odometry, so it knows the room by what it saw alone.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from ct_envs.lidar import LIDAR_BEAMS, LIDAR_CELL_M, LIDAR_RANGE_M
+from ct_envs.turtlebot3 import to_heading
+from ct_envs.turtlebot3_pool import Frame
+
+_NEAR = 0.15  # share of a straight way that may be blocked: the robot may stand too near to an obstacle already
+_DEAR = 30.0  # how much longer a way through cells is that are too near to an obstacle: a last resort
+
+
+@dataclass(frozen=True)
+class Charted:
+    """One robot's grid, with its start in the middle."""
+
+    origin: Float[np.ndarray, "2"]  # lower left corner, in the world as the robot believes it [m]
+    goal: Float[np.ndarray, "2"]  # likewise [m]
+    occupied: Bool[np.ndarray, "n n"]  # row y, column x
+    age: int = 0  # steps since the plan was made
+    target: Float[np.ndarray, "2"] | None = None
+
+
+@dataclass(frozen=True)
+class ExplorerGuide:
+    """Optimistic replanning on the lidar's grid, for the slots of a pool."""
+
+    clear_m: float  # kept between the robot's middle and what it saw
+    cell_m: float = LIDAR_CELL_M
+    side_m: float = 14.0  # of the grid: from a start at one corner of a room it reaches the other
+    every: int = 5  # steps between two plans
+    look_m: float = 0.8  # farthest waypoint: within what the lidar has shown
+
+    def init(self, frame: Frame, *_: object) -> tuple[Charted, ...]:
+        """Nothing seen yet."""
+        n = round(self.side_m / self.cell_m)
+        goal = _in_world(frame, frame.goal)
+        return tuple(
+            Charted(position - self.side_m / 2, goal[slot], np.zeros((n, n), bool))
+            for slot, position in enumerate(frame.believed_position)
+        )
+
+    def waypoint(self, memory: tuple[Charted, ...], frame: Frame) -> tuple[np.ndarray, tuple[Charted, ...]]:
+        """Vectors to targets [N, 2] (m), and what has been seen by now."""
+        here, met = frame.believed_position, frame.ranges < LIDAR_RANGE_M
+        ends = _beam_ends(frame)
+        charts = [
+            chart if frame.done[slot] else self._look(chart, ends[slot][met[slot]], here[slot])
+            for slot, chart in enumerate(memory)
+        ]
+        target = [position if c.target is None else c.target for c, position in zip(charts, here, strict=True)]
+        return to_heading(np.stack(target) - here, frame.believed_yaw_rad), tuple(charts)
+
+    def _look(self, chart: Charted, hits: np.ndarray, position: np.ndarray) -> Charted:
+        """What the beams met is marked, and now and then a new plan made."""
+        at = self._cell(chart, hits)
+        at = at[((at >= 0) & (at < len(chart.occupied))).all(-1)]
+        occupied = chart.occupied.copy()
+        occupied[at[:, 1], at[:, 0]] = True
+        chart = replace(chart, occupied=occupied, age=chart.age + 1)
+        if chart.target is not None and chart.age % self.every:
+            return chart
+        return replace(chart, target=self._plan(chart, position))
+
+    def _plan(self, chart: Charted, position: np.ndarray) -> np.ndarray:
+        """The farthest point of the shortest way that can be reached straight on."""
+        n, reach = len(chart.occupied), round(1.5 / self.cell_m)
+        ends = np.clip(np.stack([self._cell(chart, position), self._cell(chart, chart.goal)]), 0, n - 1)
+        low, high = np.maximum(ends.min(0) - reach, 0), np.minimum(ends.max(0) + reach + 1, n)
+        part = chart.occupied[low[1] : high[1], low[0] : high[0]]
+        blocked = _distance(part, self.cell_m) < self.clear_m
+        way = _way(blocked, *(ends - low))
+        if len(way) < 2:
+            return chart.goal
+        points = chart.origin + (way + low + 0.5) * self.cell_m
+        points[-1] = chart.goal
+        close = points[1:][np.linalg.norm(points[1:] - position, axis=-1) <= self.look_m]
+        share = np.linspace(0.0, 1.0, 25)[:, None, None]
+        column, row = np.moveaxis(self._cell(chart, position + share * (close - position)) - low, -1, 0)
+        inside = np.clip(row, 0, len(blocked) - 1), np.clip(column, 0, blocked.shape[1] - 1)
+        free = np.flatnonzero(~(blocked[inside] & (share[..., 0] > _NEAR)).any(0))
+        return close[free[-1]] if len(free) else points[1]
+
+    def _cell(self, chart: Charted, points: np.ndarray) -> np.ndarray:
+        """Cells [..., 2] (column, row) of points [..., 2] (m)."""
+        return np.floor((points - chart.origin) / self.cell_m).astype(int)
+
+
+def _distance(occupied: np.ndarray, cell_m: float) -> np.ndarray:
+    """Distance [m] of each cell to the nearest occupied one."""
+    if not occupied.any():
+        return np.full(occupied.shape, np.inf)
+    return ndimage.distance_transform_edt(~occupied, sampling=cell_m)  # pyright: ignore[reportReturnType]
+
+
+def _way(blocked: np.ndarray, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Cells [k, 2] (column, row) of a shortest way."""
+    first, last = (int(row * blocked.shape[1] + column) for column, row in (start, goal))
+    _, before = dijkstra(_grid(blocked), indices=last, return_predecessors=True)
+    way = [first]
+    while way[-1] != last and before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    return np.stack(np.unravel_index(way, blocked.shape)[::-1], -1)
+
+
+def _grid(blocked: np.ndarray) -> csr_array:
+    """The 8-connected graph of a grid; entering a blocked cell is dear."""
+    index = np.arange(blocked.size).reshape(blocked.shape)
+    cost = np.where(blocked, _DEAR, 1.0)
+    rows, columns, weights = [], [], []
+    for here, there, length in (
+        (np.s_[:, :-1], np.s_[:, 1:], 1.0), (np.s_[:-1, :], np.s_[1:, :], 1.0),
+        (np.s_[:-1, :-1], np.s_[1:, 1:], 2**0.5), (np.s_[:-1, 1:], np.s_[1:, :-1], 2**0.5),
+    ):  # fmt: skip
+        weight = length * (cost[here] + cost[there]).ravel() / 2
+        for a, b in ((here, there), (there, here)):
+            rows.append(index[a].ravel())
+            columns.append(index[b].ravel())
+            weights.append(weight)
+    entries = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(weights), entries), shape=(blocked.size,) * 2)
+
+
+def _beam_ends(frame: Frame) -> Float[np.ndarray, "N 360 2"]:
+    """Where beams end in the world as the robot believes it [m]; of those that met nothing, somewhere."""
+    angle = frame.believed_yaw_rad[:, None] + np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS)
+    ranges = np.minimum(frame.ranges, LIDAR_RANGE_M)[..., None]
+    return frame.believed_position[:, None] + ranges * np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def _in_world(frame: Frame, vector: np.ndarray) -> np.ndarray:
+    """Points [N, 2] of that world (m) from vectors in the robots' own frames."""
+    cosine, sine = np.cos(frame.believed_yaw_rad), np.sin(frame.believed_yaw_rad)
+    x, y = vector[:, 0], vector[:, 1]
+    return frame.believed_position + np.stack([cosine * x - sine * y, sine * x + cosine * y], -1)

@@ -1,0 +1,162 @@
+"""What the pipeline asks of robots in mazes: roadmap and controller, collection, recoveries, evaluation."""
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ct_envs import Maze, MazeEnv, UserError, load_maze
+from ct_jax.checkpoint import read_json, write_json
+from ct_jax.collect import collect
+from ct_jax.controllers.sac import SacConfig, SacController, train_controller
+from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, draw_pairs, evaluate
+from ct_jax.finetune import recover
+from ct_jax.model import TrainedModel, load_controller, save_controller
+from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
+from ct_jax.progress import Bar, Metrics
+from ct_jax.run import Run, drop_checkpoints, join_mazes, kept_row, slug, training
+from ct_jax.trajectories import Trajectories
+
+MAX_EPISODES = 100_000
+PAIR_ARRAYS = ("start", "goal", "shortest_m")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class MazeCourse:
+    """A run in mazes: ``pipeline.Course``."""
+
+    run: Run
+
+    def controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
+        """The run's own controller, or the given one, and its configuration."""
+        run, config = self.run, self.run.settings.sac
+        if run.settings.controller != "own":
+            return load_controller(run.settings.controller, run.robot)
+        if run.done("controller") is not None:
+            return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))
+        roadmap = _roadmap(run)
+        with run.stage("controller") as (folder, info):
+            with training(folder, "controller", config.iterations, metrics) as watch:
+                controller, held_out = train_controller(
+                    run.key("controller"), run.env, roadmap.maze, roadmap, config, **watch
+                )
+            save_controller(folder, run.robot, config, controller, run.made | {"held_out_success": held_out})
+            info |= {"held_out_success": held_out}
+        drop_checkpoints(folder)
+        return controller, config
+
+    def collect(self, key: jax.Array, controller: SacController, folder: Path, on_progress: Progress) -> Trajectories:
+        """Algorithm 3: in mazes so quick that nothing need be kept on the way."""
+        del folder
+        config = self.run.settings.collect
+        env = self.run.env(maps=False, auto_reset=False, horizon=config.horizon)
+        prm, mazes = self.run.settings.prm, self.run.stacked
+        return collect(key, env, mazes, controller, config, prm, on_progress=on_progress)
+
+    def recover(
+        self, key: jax.Array, policy: TransformerPolicy, controller: SacController, folder: Path, on_progress: Progress
+    ) -> Trajectories:
+        """Algorithm 4's failures and recoveries."""
+        del folder
+        settings = self.run.settings
+        return recover(
+            key, self._recovering, self.run.stacked, policy, controller, settings.recover, settings.collect,
+            settings.prm, on_progress=on_progress,
+        )  # fmt: skip
+
+    @functools.cached_property
+    def _recovering(self) -> MazeEnv:
+        """One environment, and so one compilation, for all rounds."""
+        settings = self.run.settings
+        return self.run.env(auto_reset=False, horizon=settings.recover.patience + settings.collect.horizon)
+
+    def rows(self, folder: Path, model: TrainedModel) -> Iterator[dict[str, Any]]:
+        """Every method in every maze, seen ones first."""
+        env = self.run.env(auto_reset=False)
+        for name, maze in join_mazes(self.run.mazes, self.run.eval_mazes).items():
+            for method in METHODS:
+                who = {"policy": model.policy, "controller": model.controller}
+                yield evaluated(self.run, env, folder, name, maze, method, **who)
+
+
+def _roadmap(run: Run) -> Roadmap:
+    """The roadmap of the first maze: it gives the controller its edges. Built again as quickly as it would be read."""
+    maze = next(iter(run.mazes.values()))
+    roadmap = build_roadmap(run.key("prm"), maze, radius_m=run.spec.radius_m, config=run.settings.prm)
+    if run.done("prm") is None:
+        with run.stage("prm") as (folder, info):
+            np.savez_compressed(folder / "roadmap.npz", points=roadmap.points, edges=roadmap.edges)
+            info |= {"points": len(roadmap.points), "edges": len(roadmap.edges)}
+    return roadmap
+
+
+# ------------------------------------------------------------------------------------------------------ evaluation
+
+
+def evaluated(
+    run: Run, env: MazeEnv, folder: Path, name: str, maze: Maze, method: str, *, policy: Learned,
+    controller: SacController | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """A method's row of the table for one maze; see ``kept_row``."""
+
+    def measure() -> Episodes:
+        pairs = _stored_pairs(run, name, maze)
+        return _watched(env, maze, pairs, method, name, policy, controller, run.settings.prm)
+
+    head = _head(run.robot, method, name, run.settings.episodes, run.settings.pairs_seed)
+    return kept_row(folder, name, method, head | {"seen": name in run.mazes}, measure)
+
+
+def _head(robot: str, method: str, maze: str, episodes: int, seed: int) -> dict[str, Any]:
+    """What a row is of."""
+    return {"robot": robot, "method": method, "maze": maze, "episodes": episodes, "seed": seed}
+
+
+def _watched(
+    env: MazeEnv, maze: Maze, pairs: Pairs, method: str, name: str, policy: Learned,
+    controller: SacController | None, prm: PrmConfig,
+) -> Episodes:  # fmt: skip
+    with Bar(f"{method} in {name}", len(pairs.start)) as bar:
+        return evaluate(
+            env, maze, pairs, method, policy=policy, controller=controller, prm=prm,
+            on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
+        )  # fmt: skip
+
+
+def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
+    """The evaluation's pairs: drawn once, written down, and read back ever after."""
+    robot, n, seed = run.spec, run.settings.episodes, run.settings.pairs_seed
+    file = run.folder / "evaluate" / f"pairs-{slug(name)}-{n}-{seed}.json"
+    if file.is_file():
+        found = read_json(file)
+        start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
+        return Pairs(start, goal, shortest_m, seed)
+    pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    write_json(file, {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS})
+    return pairs
+
+
+def evaluate_in_maze(
+    model: TrainedModel, method: str, seed: int, *, maze: str = "antmaze-large", episodes: int = 100,
+    engine: str = "auto",
+) -> dict[str, Any]:  # fmt: skip
+    """One method of a model in one maze; returns its row of the table.
+
+    Raises:
+        UserError: unknown maze, or no episodes.
+    """
+    if not 1 <= episodes <= MAX_EPISODES:
+        raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
+    world = load_maze(maze)
+    env = MazeEnv(model.robot, engine=engine, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
+    robot = env.robot
+    pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    name = Path(maze).stem
+    outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
+    return _head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()

@@ -1,0 +1,259 @@
+"""The Turtlebot3 end to end: the same command line and stages as in mazes, and what is its own."""
+
+import importlib.util
+import json
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from ct_envs import UserError
+from ct_envs.turtlebot3 import Turtlebot3Config
+from ct_envs.turtlebot3_pool import Turtlebot3Pool
+from ct_jax import cli, mazes, pipeline, presets, rooms
+from ct_jax.cli import main
+from ct_jax.collect import CollectConfig
+from ct_jax.collect_turtlebot3 import keeping
+from ct_jax.controllers.differential_drive import DifferentialDrive
+from ct_jax.evaluate import METHODS, Episodes
+from ct_jax.evaluate_turtlebot3 import PLANNER, draw_room_pairs, draw_rooms, evaluate_rooms, grades
+from ct_jax.finetune import RecoverConfig
+from ct_jax.finetune_turtlebot3 import recover
+from ct_jax.fit import FitConfig
+from ct_jax.model import load_model
+from ct_jax.rollout import act_as_meant
+from ct_jax.trajectories import load, unpack_maps
+
+pytestmark = [
+    pytest.mark.rank_promotion("allow"),
+    pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="PyBullet is not installed"),
+]
+
+FIT = FitConfig(updates=6, batch=4, steps=5, warmup=2, mirror=True)
+COLLECT = CollectConfig(trajectories=3, reset_interval=2, guide="shortcut", starts="maze", envs=4, horizon=400)
+TINY = replace(
+    presets.TURTLEBOT3_CPU,
+    collect=COLLECT,
+    model=replace(presets.TURTLEBOT3_CPU.model, layers=1, heads=2, width=16),
+    value=presets.ValueConfig(fit=replace(FIT, steps=1), width=16),
+    fit=FIT,
+    round_fit=FIT,
+    recover=RecoverConfig(recoveries=2, patience=20, stuck_steps=15, stuck_m=0.1, keep="relabelled"),
+    episodes=2,
+    rooms=rooms.RoomConfig(worlds=2),
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    folder: str
+    arguments: list[str]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(presets.TURTLEBOT3_PRESETS, "tiny", TINY)
+        patch.setattr(cli, "prepare_jax", lambda: None)
+        folder = str(tmp_path_factory.mktemp("runs") / "turtlebot3")
+        arguments = ["train", "turtlebot3", "--preset", "tiny", "--out", folder]
+        assert main(arguments) == 0
+        yield Trained(folder, arguments)
+
+
+def test_a_run_leaves_everything_behind(trained):
+    model = load_model(trained.folder)
+    assert model.controller == DifferentialDrive() and model.settings == TINY and model.robot == "turtlebot3"
+    rows = {row["method"]: row for row in pipeline.results(Path(trained.folder))}
+    assert tuple(rows) == METHODS
+    for row in rows.values():
+        told = row["worlds"], row["pairs"], row["episodes"], row["density"], row["noise"], row["seen"]
+        assert told == (2, 2, 4, 1.0, 0.0, False)
+        assert max(row["frontal_rate"], row["grazing_rate"]) <= row["collision_rate"]
+        assert row["success_rate"] + row["timeout_rate"] == pytest.approx(1.0)
+    page = (Path(trained.folder) / "report.html").read_text()
+    assert "The rooms" in page and "room 2" in page and "Frontal" in page and "goals reached in rooms" in page
+
+
+def test_what_was_seen_is_kept(trained):
+    data = load(Path(trained.folder) / "collect" / "trajectories.npz")
+    assert data.n == 3
+    for i, length in enumerate(data.length):
+        maps = np.asarray(unpack_maps(data.map_bits[i, :length]))
+        assert maps[:, 0].any() and (maps[:, 1].sum((1, 2)) <= 1).all()
+        np.testing.assert_allclose(
+            np.linalg.norm(data.seen[i, :length], axis=-1),
+            np.linalg.norm(data.goal[i] - data.position[i, :length], axis=-1), atol=1e-4,
+        )  # fmt: skip
+
+
+def test_a_finished_run_is_not_run_again(trained, monkeypatch):
+    monkeypatch.setattr(pipeline, "fit", lambda *a, **k: pytest.fail("run again"))
+    for name in ("collect", "recover", "evaluate_rooms"):
+        monkeypatch.setattr(rooms, name, lambda *a, **k: pytest.fail("run again"))
+    assert main([*trained.arguments, "--resume"]) == 0
+
+
+def test_evaluate_gives_the_row_of_the_run(trained, capfd):
+    """The same seed means the same rooms and pairs, in the run and afterwards."""
+    whole = pipeline.results(Path(trained.folder))[0]
+    assert main(["evaluate", trained.folder, "--worlds", "2", "--pairs", "2", "--json"]) == 0
+    row = json.loads(capfd.readouterr().out)
+    for name in set(whole) - {"wall_s", "seen"}:
+        assert row[name] == pytest.approx(whole[name]), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train", "turtlebot3", "--maze", "hall"], ["--maze", "turtlebot3", "rooms"]),
+        (["train", "turtlebot3", "--eval-maze", "hall"], ["--eval-maze", "turtlebot3"]),
+        (["train", "turtlebot3", "--engine", "mjx"], ["--engine", "turtlebot3"]),
+        (["train", "turtlebot3", "--controller", "zoo"], ["--controller", "turtlebot3"]),
+        (["train", "turtlebot3", "--preset", "huge"], ["no preset named 'huge'", "cpu, demo"]),
+        (["evaluate", "RUN", "--maze", "hall"], ["--maze is not for the turtlebot3", "--worlds"]),
+        (["evaluate", "RUN", "--worlds", "0"], ["--worlds 0", "from 1"]),
+        (["evaluate", "RUN", "--pairs", "9999999"], ["--pairs 9999999", "to"]),
+        (["evaluate", "RUN", "--noise", "-1"], ["--noise -1", "from 0"]),
+        (["evaluate", "RUN", "--noise", "nan"], ["--noise nan"]),
+        (["evaluate", "RUN", "--density", "9"], ["density"]),
+        (["evaluate", "RUN", "--density", "nan"], ["density"]),
+        (["evaluate", "zoo:point", "--worlds", "3"], ["--worlds is not for the point", "--maze"]),
+    ],
+)
+def test_bad_arguments_are_named_with_the_mend(arguments, words, trained, capsys):
+    assert main([trained.folder if each == "RUN" else each for each in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and err.count("\n") == 1
+    assert [word for word in words if word not in err] == [], err
+
+
+def test_without_pybullet_training_is_one_line(trained, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    assert main([*trained.arguments[:-1], "elsewhere"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "needs PyBullet" in err
+
+
+# ------------------------------------------------------------------------------------------------------ evaluation
+
+
+def test_rooms_of_an_evaluation_depend_on_the_seed_alone_and_fill_up():
+    one, again, fuller, other = (draw_rooms(s, 3, density=d) for s, d in ((0, 1.0), (0, 1.0), (0, 2.0), (1, 1.0)))
+    for a, b, c, d in zip(one, again, fuller, other, strict=True):
+        np.testing.assert_array_equal(a.boxes, b.boxes)
+        assert c.covered() > a.covered() != d.covered()
+    pairs = draw_room_pairs(0, one, 4)
+    np.testing.assert_array_equal(pairs.world, np.repeat([0, 1, 2], 4))
+    straight = np.linalg.norm(pairs.goal - pairs.start, axis=1)
+    assert (straight >= 1.0).all() and (pairs.shortest_m >= straight - 1e-5).all()
+
+
+def test_the_references_arrive_however_the_waves_are_cut():
+    worlds = draw_rooms(3, 2)
+    pairs = draw_room_pairs(3, worlds, 2)
+    with Turtlebot3Pool(3, processes=1) as pool:
+        cut = evaluate_rooms(pool, worlds, pairs, "planner")
+        explored = evaluate_rooms(pool, worlds, pairs, "explorer")
+    with Turtlebot3Pool(4, processes=1) as pool:
+        whole = evaluate_rooms(pool, worlds, pairs, "planner")
+    assert cut.success.all() and explored.success.all()
+    np.testing.assert_array_equal(cut.steps, whole.steps)
+    assert (cut.travelled_m > 0.9 * (pairs.shortest_m - Turtlebot3Config().goal_tolerance_m)).all()
+
+
+def test_grades_count_as_the_paper_does():
+    success, frontal, grazing = (np.array(x, bool) for x in ([1, 1, 1, 0, 0], [0, 0, 1, 0, 1], [0, 1, 1, 0, 0]))
+    none = np.zeros(5)
+    episodes = Episodes(
+        success, frontal | grazing, none, none, none, none, none, none, None, 0.0, frontal=frontal, grazing=grazing
+    )
+    assert grades(episodes) == {"full": 1, "partial": 1, "failed": 3}
+
+
+# ---------------------------------------------------------------------------------------------------- Algorithm 4
+
+
+@struct.dataclass
+class Ahead:
+    """Full speed ahead, whatever comes: it gets stuck at the first wall."""
+
+    def init(self, state):
+        return jnp.zeros(())
+
+    def act(self, memory, state, key):
+        return act_as_meant(jnp.tile(jnp.array([1.0, 0.0]), (len(state.done), 1))), memory
+
+
+CONFIG = RecoverConfig(recoveries=4, stuck_steps=10, stuck_m=0.05, patience=150, keep="joined")
+
+
+@pytest.fixture(scope="module")
+def recoveries():
+    with Turtlebot3Pool(4, processes=1, config=Turtlebot3Config(horizon=550)) as pool:
+
+        def run(**changes):
+            config = replace(CONFIG, **changes)
+            return recover(jax.random.key(1), pool, Ahead(), config, COLLECT, PLANNER)  # pyright: ignore
+
+        yield run
+
+
+def test_the_planner_brings_home_whom_it_takes_over(recoveries):
+    """What failed is stuck or out of patience; from there on it is led, and arrives."""
+    joined = recoveries()
+    last = joined.reward[np.arange(joined.n), joined.length - 1]
+    assert joined.n >= 4 and (last > -1.3).all()
+    for i, begin in enumerate(joined.learn.argmax(1)):
+        np.testing.assert_allclose(joined.action[i, :begin], np.tile([1.0, 0.0], (begin, 1)))
+        position = joined.position[i]
+        stuck = np.linalg.norm(position[begin] - position[max(begin - CONFIG.stuck_steps, 0)]) < CONFIG.stuck_m
+        assert stuck or begin == CONFIG.patience
+    pieces = recoveries(keep="separate")
+    assert pieces.n == 2 * joined.n and pieces.map_bits.shape[:2] == pieces.reward.shape
+    np.testing.assert_array_equal(pieces.length[: joined.n] + pieces.length[joined.n :], joined.length)
+
+
+def test_relabelled_steps_are_all_told_what_the_planner_would_do(recoveries):
+    data = recoveries(keep="relabelled")
+    for i, length in enumerate(data.length):
+        assert (data.learn[i, :length] == 1).all()
+        assert np.abs(data.target[i, :length] - data.action[i, :length]).max() > 0.05
+
+
+def test_a_keep_that_means_nothing_is_one_line(recoveries):
+    with pytest.raises(UserError, match="kept 'somehow'"):
+        recoveries(keep="somehow")
+
+
+def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
+    driven = []
+
+    def wave(first):
+        driven.append(first)
+        if driven == [0, 50]:
+            raise KeyboardInterrupt
+        return toy_data([3, 5], seed=first), np.array([True, False])
+
+    keep = keeping(tmp_path / "waves", mend="begin anew")(wave)
+    one, won = keep(0)
+    with pytest.raises(KeyboardInterrupt):
+        keep(50)
+    again, won_again = keep(0)
+    keep(50)
+    assert driven == [0, 50, 50]
+    np.testing.assert_array_equal(won, won_again)
+    for name in ("position", "reward", "length"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
+    (tmp_path / "waves" / "0.npz").write_bytes(b"half")
+    with pytest.raises(UserError, match=r"0\.npz.*begin anew"):
+        keep(0)
+
+
+def test_courses_are_there_for_every_robot():
+    assert {"maze": mazes.MazeCourse, "room": rooms.RoomCourse} == pipeline.COURSES
