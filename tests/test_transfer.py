@@ -1,12 +1,21 @@
 """Transfer: the trunk is the old robot's, the body the new one's, and nothing else is mixed up."""
 
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+import transfer as experiment
+
 from ct_envs import UserError
 from ct_jax.transfer import BODY, transfer
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+
+pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 SIZE = {"layers": 1, "heads": 2, "width": 16, "context": 4, "context_acting": 4}
 
@@ -41,3 +50,21 @@ def test_models_of_other_sizes_are_refused(changes):
 def test_models_of_other_depths_are_refused():
     with pytest.raises(UserError, match="differ in their layers"):
         transfer(params(0, 2, 2), params(1, 27, 8, layers=2))
+
+
+def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path):
+    """Two marks on the way end where one fit does, and a second call has nothing left to do."""
+    options = experiment.Options(point=tiny_run.folder, ant=tiny_run.folder, episodes=4, out=tmp_path)
+    target = experiment.Target.of(tiny_run.folder, 40)
+    ends = []
+    for marks in ((20, 40), (40,)):
+        folder = tmp_path / str(len(marks))
+        folder.mkdir()
+        rows = experiment.curve(target, target.model, 0, replace(options, marks=marks), folder)
+        assert [row["updates"] for row in rows] == list(marks)
+        assert experiment.curve(target, None, 0, replace(options, marks=marks), folder) == rows
+        ends.append({key: value for key, value in rows[-1].items() if key != "wall_s"})
+    assert ends[0] == ends[1]
+    both = [{"robot": robot, "start": "scratch"} | row for robot in ("ant", "point") for row in rows]
+    experiment.draw(both, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 0

@@ -1,0 +1,157 @@
+"""Transfer between the point robot and the ant (the paper's figure): success against updates, with and without.
+
+    python experiments/transfer.py [--point runs/point/cpu-0] [--ant runs/ant/cpu-0] [--seeds 0 1 2]
+
+Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
+transformer is fitted to all trajectories of a robot's run, from scratch or from the trunk of the other robot's model
+(``ct_jax.transfer``), and tried on the run's pairs in the unseen maze as training goes on. Writes
+``experiments/results/transfer.json`` and ``docs/transfer.png``.
+"""
+
+import functools
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from ct_envs import MazeEnv, load_maze, stack_mazes
+from ct_jax import trajectories as storage
+from ct_jax.checkpoint import Checkpoints, read_json, write_json
+from ct_jax.cli import guarded, prepare_jax
+from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.fit import Fit, fit, init_params, transformer_loss
+from ct_jax.model import TrainedModel, load_model
+from ct_jax.progress import Bar
+from ct_jax.run import default_mazes, provenance
+from ct_jax.trajectories import Trajectories
+from ct_jax.transfer import transfer
+
+RESULTS = Path(__file__).parent / "results" / "transfer.json"
+PICTURE = Path(__file__).parents[1] / "docs" / "transfer.png"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    point: Path = Path("runs/point/cpu-0")
+    """A finished run of the point robot."""
+    ant: Path = Path("runs/ant/cpu-0")
+    """A finished run of the ant."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits."""
+    marks: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1600)
+    """After how many updates to evaluate."""
+    episodes: int = 100
+    """Start-goal pairs."""
+    out: Path = Path("runs/transfer")
+    """Folder of the curves; what is finished there is not run again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A robot that a transformer is fitted for."""
+
+    model: TrainedModel
+    data: Trajectories
+    env: MazeEnv
+    learner: Fit
+
+    @staticmethod
+    def of(run: Path, updates: int) -> "Target":
+        """The robot of a finished run, with all its trajectories and its last fit's settings at a steady rate."""
+        model = load_model(str(run))
+        settings = model.settings
+        files = [run / "collect" / "trajectories.npz", *sorted((run / "finetune").glob("trajectories-*.npz"))]
+        config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
+        env = MazeEnv(model.robot, map_cell_m=settings.model.map_cell_m, auto_reset=False)
+        learner = Fit(transformer_loss(model.policy.model), config, settings.model.map_cell_m, env.robot)
+        return Target(model, storage.concatenate([storage.load(file) for file in files]), env, learner)
+
+
+def curve(target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path) -> list[dict]:
+    """Success after each number of updates, from a source's trunk or from scratch; resumable."""
+    init_key, fit_key = jax.random.split(jax.random.key(seed))
+    params = init_params(init_key, target.model.policy.model, target.data)
+    if source is not None:
+        params = transfer(source.policy.params, params)
+    seen, unseen = default_mazes(target.model.robot)
+    mazes, maze = stack_mazes([load_maze(name) for name in seen]), load_maze(unseen[0])
+    robot = target.env.robot
+    pairs = draw_pairs(0, maze, options.episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    # Saved after every chunk, so that each mark goes on from the one before.
+    checkpoints = Checkpoints(folder / "checkpoints", every_s=0.0)
+    rows = []
+    with Bar(str(folder.relative_to(options.out)), max(options.marks)) as bar:
+        for mark in sorted(options.marks):
+            file = folder / f"{mark}.json"
+            if not file.is_file():
+                params_now = fit(
+                    fit_key, target.learner, params, target.data, mazes, updates=mark, checkpoints=checkpoints,
+                    on_progress=lambda update, loss: bar.update(update, f"loss {loss:.4f}"),
+                )  # fmt: skip
+                policy = replace(target.model.policy, params=params_now)
+                episodes = evaluate(target.env, maze, pairs, "ct", policy=policy)
+                write_json(
+                    file, {"updates": mark, "maze": unseen[0], "episodes": options.episodes} | episodes.summary()
+                )
+            rows.append(read_json(file))
+    checkpoints.close()
+    return rows
+
+
+def measure(options: Options) -> list[dict[str, Any]]:
+    """All curves' rows."""
+    runs = {"point": options.point, "ant": options.ant}
+    make = functools.cache(lambda robot: Target.of(runs[robot], max(options.marks)))
+    made = {name: value for name, value in provenance().items() if name in ("commit", "hardware", "created")}
+    rows = []
+    for robot, other in (("ant", "point"), ("point", "ant")):
+        for seed in options.seeds:
+            for start in ("scratch", "transfer"):
+                source = make(other).model if start == "transfer" else None
+                folder = options.out / robot / f"{start}-{seed}"
+                folder.mkdir(parents=True, exist_ok=True)
+                head = {"robot": robot, "start": other if source else "scratch", "seed": seed}
+                rows += [head | row | made for row in curve(make(robot), source, seed, options, folder)]
+    return rows
+
+
+def draw(rows: list[dict[str, Any]], file: Path) -> None:
+    """Success against updates: means over seeds, and their range."""
+    figure = Figure((8.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for ax, robot in zip(axes, ("ant", "point"), strict=True):
+        mine = [row for row in rows if row["robot"] == robot]
+        for start, colour in zip(sorted({row["start"] for row in mine}), ("#1b6ca8", "#c8400e"), strict=False):
+            marks = sorted({row["updates"] for row in mine})
+            values = [
+                [100 * r["success_rate"] for r in mine if (r["start"], r["updates"]) == (start, mark)] for mark in marks
+            ]
+            name = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
+            ax.plot(marks, [np.mean(v) for v in values], marker="o", color=colour, label=name)
+            ax.fill_between(marks, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+        ax.set(xscale="log", xlabel="updates", title=robot, ylim=(0, 100), xticks=marks, xticklabels=map(str, marks))
+        ax.minorticks_off()
+        ax.legend(loc="lower right", frameon=False)
+    axes[0].set_ylabel("success in the unseen maze [%]")
+    figure.savefig(file, dpi=150)
+
+
+def main(options: Options) -> None:
+    """Run the experiment."""
+    prepare_jax()
+    rows = measure(options)
+    RESULTS.parent.mkdir(parents=True, exist_ok=True)
+    write_json(RESULTS, {"command": " ".join(["python", *sys.argv]), "rows": rows})
+    draw(rows, PICTURE)
+    print(f"results: {RESULTS}\npicture: {PICTURE}")
+
+
+if __name__ == "__main__":
+    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
