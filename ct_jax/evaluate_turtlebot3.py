@@ -103,26 +103,29 @@ def evaluate_rooms(
     begun = time.perf_counter()
     assert pairs.world is not None
     key = jax.random.key(pairs.seed)
-    rooms = [Room(world, build_roadmap(key, world, radius_m=RADIUS_M, config=PLANNER)) for world in worlds]
+    rooms = [_room(key, world) for world in worlds] if method in GUIDED else []
     drives: list[Drive] = []
     asked: list[np.ndarray] = []
     for first in range(0, len(pairs.start), pool.n):
         which = range(first, min(first + pool.n, len(pairs.start)))
-        wave = Wave(
-            [Episode(worlds[pairs.world[i]], pairs.start[i], pairs.goal[i], i) for i in which],
-            [rooms[pairs.world[i]] for i in which],
-        )
+        episodes = [Episode(worlds[pairs.world[i]], pairs.start[i], pairs.goal[i], i) for i in which]
         if method in GUIDED:
             guide = make_guide("shortcut" if method == "planner" else method, PLANNER)
+            wave = Wave(episodes, [rooms[pairs.world[i]] for i in which])
             drives += drive_guided(pool, wave, guide, controller)
         else:
             assert policy is not None
             driver = PolicyDriver(policy, jax.random.fold_in(key, first))
             begin = _telling(driver, asked, len(which))
-            drives += drive(pool, wave.episodes, driver, begin)
+            drives += drive(pool, episodes, driver, begin)
         if on_progress is not None:
             on_progress(first // pool.n + 1, len(drives))
     return _outcome(drives, pairs, time.perf_counter() - begun, np.concatenate(asked) if asked else None)
+
+
+def _room(key: jax.Array, world: World) -> Room:
+    """A world with the roadmap of the reference planner."""
+    return Room(world, build_roadmap(key, world, radius_m=RADIUS_M, config=PLANNER))
 
 
 def grades(episodes: Episodes) -> dict[str, int]:

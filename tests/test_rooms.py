@@ -190,7 +190,7 @@ class Ahead:
         return act_as_meant(jnp.tile(jnp.array([1.0, 0.0]), (len(state.done), 1))), memory
 
 
-CONFIG = RecoverConfig(recoveries=4, stuck_steps=10, stuck_m=0.05, patience=150, keep="joined")
+CONFIG = RecoverConfig(recoveries=1, stuck_steps=10, stuck_m=0.05, patience=150, keep="joined")
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_the_planner_brings_home_whom_it_takes_over(recoveries):
     """What failed is stuck or out of patience; from there on it is led, and arrives."""
     joined = recoveries()
     last = joined.reward[np.arange(joined.n), joined.length - 1]
-    assert joined.n >= 4 and (last > -1.3).all()
+    assert joined.n >= 1 and (last > -1.3).all()
     for i, begin in enumerate(joined.learn.argmax(1)):
         np.testing.assert_allclose(joined.action[i, :begin], np.tile([1.0, 0.0], (begin, 1)))
         position = joined.position[i]

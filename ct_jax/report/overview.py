@@ -152,9 +152,11 @@ def _figures(row: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def _paths(run: Run) -> list[Block]:
-    """The main method's paths in the first seen and the first unseen maze."""
+    """The main method's paths in the first seen and the first unseen maze, or in the two rooms it failed most in."""
     mine = [e for e in run.episodes if e.method == words.main_method(run) and e.maze in run.walls]
-    shown = [e for seen in (True, False) for e in [m for m in mine if m.seen == seen][:1]]
+    if words.in_rooms(run.rows):
+        mine = sorted(mine, key=lambda e: int(e.success.sum()) - len(e.success))
+    shown = ([e for e in mine if e.seen][:1] + [e for e in mine if not e.seen])[:2]
     if not shown:
         return []
     tallest = max(_HALF * pictures.aspect(run.walls[e.maze]) for e in shown)
