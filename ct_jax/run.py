@@ -295,9 +295,12 @@ def provenance() -> dict[str, Any]:
 
 
 def _command() -> str:
-    program = Path(sys.argv[0])
-    ours = ["ct-jax"] if program.name in ("ct-jax", "cli.py") else ["python", program.name]
-    return shlex.join([*ours, *sys.argv[1:]])
+    program = Path(sys.argv[0]).resolve()
+    if program.name in ("ct-jax", "cli.py"):
+        return shlex.join(["ct-jax", *sys.argv[1:]])
+    # From the repository's root, and without what the machine's folders are called.
+    inside = program.is_relative_to(Path.cwd())
+    return shlex.join(["python", str(program.relative_to(Path.cwd())) if inside else program.name, *sys.argv[1:]])
 
 
 def _commit() -> str:
