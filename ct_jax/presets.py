@@ -103,6 +103,7 @@ _ANT_SAC = SacConfig(
     reset_velocity_mps=0.1,
     frame="heading",
     mirror=True,
+    relabel=0.5,
     chain=True,
 )
 
