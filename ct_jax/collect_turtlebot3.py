@@ -127,6 +127,7 @@ class ShortcutGuide:
 
     margin_m: float  # kept beyond the robot's radius, where the robot itself has as much room
     look_m: float = 2.0  # farthest waypoint
+    waypoint_tolerance_m: float = 0.05  # a nearer one is passed: the controller would come to rest there
 
     def init(self, frame: Frame, episodes: Sequence[Episode], rooms: Sequence[Room]) -> tuple[Field, ...]:
         """The goals joined to their roadmaps."""
@@ -152,19 +153,22 @@ class ShortcutGuide:
     def _choose(self, field: Field, position: np.ndarray) -> np.ndarray:
         """The best point in sight; where there is none, what the robot headed for."""
         away = np.linalg.norm(field.points - position, axis=-1)
-        way = np.where(away <= self.look_m, away + field.to_go, np.inf)
+        passed = (away < self.waypoint_tolerance_m) & (field.to_go > 0)
+        way = np.where((away <= self.look_m) & ~passed, away + field.to_go, np.inf)
         best = np.argsort(way)[: int(np.isfinite(way).sum())]
+        # Beside a waypoint that is passed, the way on may have a little less room than it has from there.
+        slack = self.waypoint_tolerance_m if passed.any() else 0.0
         for some in (best[:_LOOK], best[_LOOK:]):
-            free = np.flatnonzero(self._sees(field.world, position, field.points[some]))
+            free = np.flatnonzero(self._sees(field.world, position, field.points[some], slack))
             if len(free):
                 return field.points[some[free[0]]]
         return field.target
 
-    def _sees(self, world: World, position: np.ndarray, points: np.ndarray) -> np.ndarray:
+    def _sees(self, world: World, position: np.ndarray, points: np.ndarray, slack_m: float = 0.0) -> np.ndarray:
         """Whether the ways from a position [2] to points [k, 2] (m) are free; one that is near an obstacle already may
         stay as near."""
         ends = np.minimum(world.clearance(points), float(world.clearance(position))) - _NUDGE_M
-        room = np.minimum(ends, RADIUS_M + self.margin_m)
+        room = np.minimum(ends, RADIUS_M + max(self.margin_m - slack_m, 0.0))
         return world.segment_free(np.broadcast_to(position, points.shape), points, room)
 
 
