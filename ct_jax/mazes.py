@@ -109,11 +109,11 @@ def evaluated(
         pairs = _stored_pairs(run, name, maze)
         return _watched(env, maze, pairs, method, name, policy, controller, run.settings.prm)
 
-    head = _head(run.robot, method, name, run.settings.episodes, run.settings.pairs_seed)
-    return kept_row(folder, name, method, head | {"seen": name in run.mazes}, measure)
+    what = head(run.robot, method, name, run.settings.episodes, run.settings.pairs_seed)
+    return kept_row(folder, name, method, what | {"seen": name in run.mazes}, measure)
 
 
-def _head(robot: str, method: str, maze: str, episodes: int, seed: int) -> dict[str, Any]:
+def head(robot: str, method: str, maze: str, episodes: int, seed: int) -> dict[str, Any]:
     """What a row is of."""
     return {"robot": robot, "method": method, "maze": maze, "episodes": episodes, "seed": seed}
 
@@ -159,4 +159,4 @@ def evaluate_in_maze(
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     name = Path(maze).stem
     outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
-    return _head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
+    return head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()

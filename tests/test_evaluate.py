@@ -14,7 +14,7 @@ from ct_envs import POINT, MazeEnv, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
 from ct_jax.collect import run_episodes
 from ct_jax.evaluate import Episodes, Pairs, bootstrap, draw_pairs, evaluate, wilson
-from ct_jax.pipeline import result_row
+from ct_jax.mazes import head
 from ct_jax.policy import TransformerPolicy
 from ct_jax.rollout import act_as_meant
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
@@ -122,7 +122,7 @@ def test_spl():
 
 
 def test_the_row_of_the_table_has_what_other_tools_rely_on():
-    row = result_row("point", "ct", "hall", episodes())
+    row = head("point", "ct", "hall", 4, 3) | episodes().summary()
     contract = (
         "robot method maze episodes seed success_rate success_ci95 return_mean return_scaled spl collision_rate "
         "timeout_rate steps_mean wall_s"
