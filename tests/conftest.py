@@ -5,7 +5,9 @@ jax and numpy read the environment variables once, when first imported, so they 
 
 import contextlib
 import dataclasses
+import fcntl
 import io
+import json
 import os
 from pathlib import Path
 
@@ -190,10 +192,22 @@ def islands(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory, tiny_settings, islands):
-    """A run that nothing interrupted. Whoever asks for it needs ``rank_promotion("allow")``."""
+    """A run that nothing interrupted, one for all workers. Whoever asks for it needs ``rank_promotion("allow")``."""
+    ours = tmp_path_factory.getbasetemp()
+    root = ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours
+    with (root / "tiny-run.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        said = root / "tiny-run.json"
+        if not said.is_file():
+            run = _make_tiny_run(root / "tiny-run", tiny_settings, islands)
+            said.write_text(json.dumps(dataclasses.asdict(run) | {"folder": str(run.folder)}))
+        found = json.loads(said.read_text())
+        return TinyRun(**found | {"folder": Path(found["folder"])})
+
+
+def _make_tiny_run(folder, tiny_settings, islands) -> TinyRun:
     from ct_jax.cli import main
 
-    folder = tmp_path_factory.mktemp("runs") / "whole"
     arguments = ["train", "point", "--preset", "tiny", "--maze", str(islands), "--eval-maze", "antmaze-umaze"]
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -1,5 +1,6 @@
 """The experiments' plans: which rows there are, and that all of them are made and kept."""
 
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -36,15 +37,17 @@ def test_variants_can_be_chosen_and_unknown_ones_are_refused():
         plan_for("point", "cpu", controller="own", variants=("gpu",))
 
 
-def test_every_row_is_made_once_and_kept(tiny, tiny_settings, tmp_path, monkeypatch):
-    monkeypatch.setattr("_variants.default_mazes", lambda robot: (("antmaze-umaze",), ()))
-    settings = replace(tiny_settings, rounds=0)
+def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path, monkeypatch):
+    """A finished run is taken as it is, the baselines are learned from its data, and nothing is done twice."""
+    shutil.copytree(tiny_run.folder, tmp_path / "one-0")
+    mazes = ((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],), ("antmaze-umaze",))
+    monkeypatch.setattr("_variants.default_mazes", lambda robot: mazes)
     cql = CqlConfig(updates=2, batch=4, width=8, samples=1)
-    plan = Plan({"one": settings}, Baselines(cql, replace(settings.sac, iterations=4, warmup=1)))
+    plan = Plan({"one": tiny_settings}, Baselines(cql, replace(tiny_settings.sac, iterations=4, warmup=1)))
     rows = run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path)
-    assert [row["method"] for row in rows] == ["ct", "planner", "explorer", "pt-cql", "sac"]
+    assert [row["method"] for row in rows] == [*["ct", "planner", "explorer"] * 2, *["pt-cql"] * 2, *["sac"] * 2]
     assert all(row["episodes"] == 4 and row["seed"] == 0 and row["variant"] == "one" for row in rows)
-    monkeypatch.setattr("_variants.train_cql", None)  # nothing is learned twice
+    monkeypatch.setattr("_variants.train_cql", None)
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
 
 
