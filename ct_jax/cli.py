@@ -243,7 +243,8 @@ def prepare_jax() -> None:
 def _train(command: Train) -> None:
     from ct_envs.robots import get_robot
 
-    _CHECKS[get_robot(command.robot).course](command)  # before what takes seconds
+    if get_robot(command.robot).course == "room":
+        _check_in_rooms(command)  # before what takes seconds
     prepare_jax()
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
@@ -271,10 +272,6 @@ def _train(command: Train) -> None:
     print(f"model:  {run.folder / 'model'}\nreport: {report}")
 
 
-def _check_in_maze(command: Train) -> None:
-    """What can be told of a training in mazes before anything is loaded: nothing yet."""
-
-
 def _check_in_rooms(command: Train) -> None:
     """Raises UserError for options that mean nothing in rooms, or where PyBullet is missing."""
     from ct_envs.turtlebot3 import load_pybullet
@@ -284,9 +281,6 @@ def _check_in_rooms(command: Train) -> None:
             option = name.replace("_", "-")
             raise UserError(f"--{option} is not for the {command.robot}, which drives in random rooms; leave it out")
     load_pybullet()
-
-
-_CHECKS: dict[str, Callable[[Train], None]] = {"maze": _check_in_maze, "room": _check_in_rooms}
 
 
 def _evaluate(command: Evaluate) -> None:

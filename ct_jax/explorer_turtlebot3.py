@@ -140,6 +140,4 @@ def _beam_ends(frame: Frame) -> Float[np.ndarray, "N 360 2"]:
 
 def _in_world(frame: Frame, vector: np.ndarray) -> np.ndarray:
     """Points [N, 2] of that world (m) from vectors in the robots' own frames."""
-    cosine, sine = np.cos(frame.believed_yaw_rad), np.sin(frame.believed_yaw_rad)
-    x, y = vector[:, 0], vector[:, 1]
-    return frame.believed_position + np.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
+    return frame.believed_position + to_heading(vector, -frame.believed_yaw_rad)

@@ -23,7 +23,7 @@ from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import METHODS
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
-from ct_jax.mazes import MazeCourse, evaluate_in_maze, evaluated
+from ct_jax.mazes import MazeCourse, evaluate_in_maze
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model
 from ct_jax.policy import TransformerPolicy
 from ct_jax.progress import Bar, Metrics
@@ -32,8 +32,6 @@ from ct_jax.run import Run, drop_checkpoints, open_run, training
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
 from ct_jax.value import ValueNetwork
-
-__all__ = ["COURSES", "Course", "drop_checkpoints", "evaluate_model", "evaluated", "results", "train", "training"]
 
 MAX_SEED = 2**32 - 1
 Progress = Callable[[int, int], None]

@@ -20,9 +20,10 @@ from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import RecoverConfig
+from ct_jax.mazes import evaluated
 from ct_jax.presets import Settings, get_preset
 from ct_jax.progress import Metrics
-from ct_jax.run import Run, default_mazes, join_mazes, load_mazes
+from ct_jax.run import Run, default_mazes, drop_checkpoints, join_mazes, load_mazes, training
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -142,11 +143,11 @@ def run_plan(
                 found += run_baselines(run, plan.baselines)
             if place or seed != seeds[0]:
                 found = [row for row in found if row["method"] not in ("planner", "explorer")]
-            rows += [_label(run, name, row) for row in found]
+            rows += [label(run, name, row) for row in found]
     return rows
 
 
-def _label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
+def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     """A row with what made it."""
     config = read_json(run.folder / "config.json")
     made = {key: config[key] for key in ("commit", "hardware", "created")}
@@ -185,14 +186,14 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
     file = folder / "weights.safetensors"
     if not file.is_file():
         metrics = Metrics(folder)
-        with pipeline.training(folder, name, total, metrics) as watch:
+        with training(folder, name, total, metrics) as watch:
             learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
         metrics.close()
         save_weights(file, learned.params)
-        pipeline.drop_checkpoints(folder)
+        drop_checkpoints(folder)
     policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
     mazes = join_mazes(run.mazes, run.eval_mazes).items()
-    return [pipeline.evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+    return [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
 
 
 # --------------------------------------------------------------------------------------------------------- results

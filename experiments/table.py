@@ -32,16 +32,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     """One line for each maze, model and method, with 95 % intervals."""
     rows = results["rows"]
     falls = any(row.get("fall_rate") for row in rows)
-    names = [
-        "maze",
-        "model",
-        "method",
-        "success %",
-        "SPL",
-        "return / 100",
-        "collided %",
-        *(["fell %"] if falls else []),
-    ]
+    names = ["maze", "model", "method", "success %", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     for row in sorted(rows, key=lambda row: not row["seen"]):
         maze = f"{row['maze']} ({'seen' if row['seen'] else 'unseen'})"

@@ -69,6 +69,8 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
 
 def run_all(options: Options) -> dict[str, Any]:
     """Train and evaluate everything with each seed, continuing what is there; returns what the results file holds."""
+    from _variants import label
+
     from ct_jax import pipeline
     from ct_jax.model import load_model
     from ct_jax.run import Run
@@ -87,11 +89,11 @@ def run_all(options: Options) -> dict[str, Any]:
             before.append(run)
             first = len(before) == 1 and seed == options.seeds[0]
             found = [row for row in pipeline.results(folder) if first or row["method"] not in REFERENCES]
-            rows += [_label(run, name, row) for row in found]
+            rows += [label(run, name, row) for row in found]
             if name in SWEPT or name == options.preset:
                 model = load_model(str(folder))
                 for kind, found in _sweep(folder, model, settings, references=first).items():
-                    sweeps[kind] += [_label(run, name, row) for row in found]
+                    sweeps[kind] += [label(run, name, row) for row in found]
     return {"rows": rows, **sweeps}
 
 
@@ -147,16 +149,6 @@ def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not file.is_file():
         write_json(file, measure())
     return read_json(file)
-
-
-def _label(run: Any, variant: str, row: dict[str, Any]) -> dict[str, Any]:
-    """A row with what made it."""
-    from ct_jax.checkpoint import read_json
-
-    config = read_json(run.folder / "config.json")
-    made = {key: config[key] for key in ("commit", "hardware", "created")}
-    wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
-    return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | made
 
 
 def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) -> None:

@@ -167,8 +167,8 @@ def _results(run: Run) -> str:
 
 def _columns(run: Run) -> list[tuple[str, str, str, Callable[[float], str]]]:
     """The columns of the tables: contacts are told apart for some robots only."""
-    told = [name for name in ("frontal_rate", "grazing_rate") if any(name in row for row in run.rows)]
-    return [column for column in _COLUMNS if column[1] not in ("frontal_rate", "grazing_rate") or column[1] in told]
+    apart = ("frontal_rate", "grazing_rate")
+    return [column for column in _COLUMNS if column[1] not in apart or any(column[1] in row for row in run.rows)]
 
 
 def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:
