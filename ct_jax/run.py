@@ -137,9 +137,14 @@ def kept_row(
     file = folder / f"{slug(name)}-{method}.json"
     if not file.is_file():
         episodes = measure()
-        _save_episodes(file.with_suffix(".npz"), episodes)
+        _save_episodes(episodes_file(folder, name, method), episodes)
         write_json(file, head | episodes.summary())
     return read_json(file)
+
+
+def episodes_file(folder: Path, name: str, method: str) -> Path:
+    """Where a row's episodes are."""
+    return folder / f"{slug(name)}-{slug(method)}.npz"
 
 
 def _save_episodes(file: Path, episodes: Episodes) -> None:

@@ -1,5 +1,6 @@
 """What the experiments share: the method's variants and the baselines, on the same data and the same pairs."""
 
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
 
 from ct_envs import UserError
@@ -23,7 +25,17 @@ from ct_jax.finetune import RecoverConfig
 from ct_jax.mazes import evaluated
 from ct_jax.presets import Settings, get_preset
 from ct_jax.progress import Metrics
-from ct_jax.run import Run, default_mazes, drop_checkpoints, join_mazes, load_mazes, training
+from ct_jax.run import (
+    Run,
+    default_mazes,
+    drop_checkpoints,
+    episodes_file,
+    join_mazes,
+    load_mazes,
+    open_run,
+    provenance,
+    training,
+)
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -54,7 +66,8 @@ def experiment(robot: str, about: str | None) -> int:
         plan = plan_for(robot, options.preset, controller=options.controller, variants=options.variants)
         out = options.out or Path("runs") / robot
         rows = run_plan(robot, plan, preset=options.preset, seeds=options.seeds, out=out, engine=options.engine)
-        _write_results(RESULTS / f"{robot}-{options.preset}.json", " ".join(["python", *sys.argv]), rows)
+        results = {"command": provenance()["command"], "rows": rows}
+        _write_results(RESULTS / f"{robot}-{options.preset}.json", results)
 
     return guarded(run)
 
@@ -131,14 +144,18 @@ def run_plan(
     seen, unseen = default_mazes(robot)
     rows = []
     for seed in seeds:
+        before: list[Run] = []
         for place, (name, settings) in enumerate(plan.variants.items()):
             run = Run(
                 folder=out / f"{name}-{seed}", robot=robot, preset=preset, settings=settings,
                 mazes=load_mazes(seen), eval_mazes=load_mazes(unseen), seed=seed, engine=engine,
             )  # fmt: skip
             print(f"== {robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
+            for other in before:
+                share(other, run)
             pipeline.train(run, resume=True)
-            found = pipeline.results(run.folder)
+            before.append(run)
+            found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
             if place == 0 and plan.baselines is not None:
                 found += run_baselines(run, plan.baselines)
             if place or seed != seeds[0]:
@@ -147,12 +164,34 @@ def run_plan(
     return rows
 
 
+def share(source: Run, run: Run) -> None:
+    """Take over the stages that would come out alike: the planning trajectories, and what was fitted to them."""
+
+    def made_of(settings: Settings, stage: str) -> tuple[Any, ...]:
+        found = settings.prm, settings.controller, settings.sac
+        if stage in ("collect", "fit"):
+            found += settings.collect, settings.rooms
+        return (*found, settings.model, settings.fit, settings.value) if stage == "fit" else found
+
+    with open_run(run, resume=True):
+        for stage in ("controller", "collect", "fit"):
+            same = made_of(source.settings, stage) == made_of(run.settings, stage)
+            if same and source.done(stage) is not None and not (run.folder / stage).exists():
+                shutil.copytree(source.folder / stage, run.folder / stage)
+
+
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     """A row with what made it."""
     config = read_json(run.folder / "config.json")
     made = {key: config[key] for key in ("commit", "hardware", "created")}
     wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
     return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | made
+
+
+def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, str]:
+    """Which of a row's episodes succeeded, as ones and zeros: methods are compared pair by pair."""
+    with np.load(episodes_file(folder, row["maze"], row["method"])) as episodes:
+        return {"outcomes": "".join("01"[int(won)] for won in episodes["success"])}
 
 
 # ------------------------------------------------------------------------------------------------------- baselines
@@ -193,15 +232,16 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
         drop_checkpoints(folder)
     policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
     mazes = join_mazes(run.mazes, run.eval_mazes).items()
-    return [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+    rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+    return [row | outcomes(folder, row) for row in rows]
 
 
 # --------------------------------------------------------------------------------------------------------- results
 
 
-def _write_results(file: Path, command: str, rows: list[dict[str, Any]]) -> None:
+def _write_results(file: Path, results: dict[str, Any]) -> None:
     """Write the rows with the command that made them, and print them."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_json(file, {"command": command, "rows": rows})
-    print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in rows])
+    write_json(file, results)
+    print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in results["rows"]])
     print(f"results: {file}")

@@ -12,45 +12,77 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ct_jax.evaluate import wilson_of
 
 ROOT = Path(__file__).parents[1]
 
 
-def percent(row: dict[str, Any], name: str) -> str:
-    """A rate in percent with its interval."""
-    low, high = row[f"{name}_ci95"]
-    return f"{100 * row[f'{name}_rate']:.0f} ({100 * low:.0f} to {100 * high:.0f})"
-
-
-def mean(value: float, interval: list[float], digits: int) -> str:
-    """A mean with its interval."""
-    return f"{value:.{digits}f} ({interval[0]:.{digits}f} to {interval[1]:.{digits}f})"
-
-
 def experiment_table(results: dict[str, Any]) -> list[str]:
-    """One line for each maze, model and method, with 95 % intervals."""
+    """One line for each maze and method, its models together, and what fine-tuning adds, with 95 % intervals."""
     rows = results["rows"]
     falls = any(row.get("fall_rate") for row in rows)
-    names = ["maze", "model", "method", "success %", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
+    names = ["maze", "method", "success %", "each model", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    together: dict[tuple[bool, str, str], list[dict[str, Any]]] = {}
     for row in sorted(rows, key=lambda row: not row["seen"]):
-        maze = f"{row['maze']} ({'seen' if row['seen'] else 'unseen'})"
-        cells = [maze, f"{row['variant']}, seed {row['model_seed']}", row["method"], percent(row, "success")]
-        cells += [mean(row["spl"], row["spl_ci95"], 2)]
-        cells += [mean(row["return_scaled"], row["return_scaled_ci95"], 1), percent(row, "collision")]
-        cells += [percent(row, "fall")] if falls else []
+        together.setdefault((row["seen"], row["maze"], method_name(row)), []).append(row)
+    for (seen, maze, name), models in together.items():
+        each = ", ".join(f"{100 * row['success_rate']:.0f}" for row in models) if models[0]["method"] == "ct" else ""
+        cells = [f"{maze} ({'seen' if seen else 'unseen'})", name, pooled(models, "success"), each]
+        cells += [f"{np.mean([row['spl'] for row in models]):.2f}"]
+        cells += [f"{np.mean([row['return_scaled'] for row in models]):.1f}", pooled(models, "collision")]
+        cells += [pooled(models, "fall")] if falls else []
         lines.append("| " + " | ".join(cells) + " |")
+    lines += differences(together)
     made = {(row["commit"], row["hardware"], row["created"][:10]) for row in rows}
     commits, machines, days = (", ".join(sorted({m[i] for m in made})) for i in range(3))
     pairs = {(row["episodes"], row["seed"]) for row in rows}
     on = "; ".join(f"{n} pairs of seed {seed}" for n, seed in sorted(pairs))
-    walls = ", ".join(
-        f"{variant} {minutes:.0f} min"
-        for variant, minutes in dict.fromkeys((row["variant"], row["run_wall_s"] / 60) for row in rows)
-    )
-    note = f"`{results['command']}`; {on} in each maze, 95 % intervals; commit {commits}; {machines}; {days}; {walls}."
-    return [*lines, "", note]
+    seeds = ", ".join(str(seed) for seed in sorted({row["model_seed"] for row in rows}))
+    walls: dict[str, list[float]] = {}
+    for row in rows:
+        walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
+    took = ", ".join(f"{variant} {np.mean(minutes):.0f} min" for variant, minutes in walls.items())
+    note = f"`{results['command']}`; {on} in each maze; models of seeds {seeds}; 95 % intervals; commit {commits}; "
+    return [*lines, "", f"{note}{machines}; {days}; a model takes: {took}."]
+
+
+def method_name(row: dict[str, Any]) -> str:
+    """What the paper calls a row's method; of other variants, the name."""
+    method, variant = str(row["method"]), str(row["variant"])
+    if method != "ct":
+        return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
+    return {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"}.get(variant, f"CT, `{variant}`")
+
+
+def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
+    """F-CT less CT in each maze, pair by pair and model by model."""
+    lines = []
+    for (seen, maze, name), tuned in together.items():
+        plain = together.get((seen, maze, "CT"))
+        if name == "F-CT" and plain is not None:
+            of_seed = {row["model_seed"]: won(row) for row in plain}
+            changes = [won(row) - of_seed[row["model_seed"]] for row in tuned if row["model_seed"] in of_seed]
+            low, high = interval_of_mean(np.stack(changes))
+            mean = 100 * np.mean(changes)
+            lines += [f"{maze}: F-CT less CT {mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) of 100"]
+    return ["", "; ".join(lines) + "."] if lines else []
+
+
+def won(row: dict[str, Any]) -> np.ndarray:
+    """Outcomes of a row's episodes, 0 or 1, [n]."""
+    return np.array([int(digit) for digit in row["outcomes"]])
+
+
+def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
+    """95 % interval of the mean of values [models, pairs]: a bootstrap that draws both models and pairs."""
+    rng = np.random.default_rng(0)
+    models, pairs = (rng.integers(n, size=(10_000, n)) for n in values.shape)
+    means = [values[np.ix_(m, p)].mean() for m, p in zip(models, pairs, strict=True)]
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def room_table(results: dict[str, Any]) -> list[str]:

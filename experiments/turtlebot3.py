@@ -9,7 +9,6 @@ one fixed room. Everything finished is kept: the same command goes on. Writes
 ``experiments/results/turtlebot3-PRESET.json`` and the plots ``docs/turtlebot3-density.png`` and ``-noise.png``.
 """
 
-import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -69,7 +68,7 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
 
 def run_all(options: Options) -> dict[str, Any]:
     """Train and evaluate everything with each seed, continuing what is there; returns what the results file holds."""
-    from _variants import label
+    from _variants import label, outcomes, share
 
     from ct_jax import pipeline
     from ct_jax.model import load_model
@@ -84,32 +83,17 @@ def run_all(options: Options) -> dict[str, Any]:
             run = Run(folder, "turtlebot3", options.preset, settings, {}, {}, seed, "auto")
             print(f"== turtlebot3: {name}, seed {seed}, in {folder}", file=sys.stderr)
             for other in before:
-                _share(other, run)
+                share(other, run)
             pipeline.train(run, resume=True)
             before.append(run)
             first = len(before) == 1 and seed == options.seeds[0]
             found = [row for row in pipeline.results(folder) if first or row["method"] not in REFERENCES]
-            rows += [label(run, name, row) for row in found]
+            rows += [label(run, name, row | outcomes(folder / "evaluate", row)) for row in found]
             if name in SWEPT or name == options.preset:
                 model = load_model(str(folder))
                 for kind, found in _sweep(folder, model, settings, references=first).items():
                     sweeps[kind] += [label(run, name, row) for row in found]
     return {"rows": rows, **sweeps}
-
-
-def _share(source: Any, run: Any) -> None:
-    """Take over the stages that would come out alike: the planning trajectories, and what was fitted to them."""
-    from ct_jax.run import open_run
-
-    def made_of(settings: Any, stage: str) -> tuple[Any, ...]:
-        data = settings.prm, settings.collect, settings.rooms
-        return data if stage == "collect" else (*data, settings.model, settings.fit, settings.value)
-
-    with open_run(run, resume=True):
-        for stage in ("collect", "fit"):
-            same = made_of(source.settings, stage) == made_of(run.settings, stage)
-            if same and source.done(stage) is not None and not (run.folder / stage).exists():
-                shutil.copytree(source.folder / stage, run.folder / stage)
 
 
 def _sweep(folder: Path, model: Any, settings: Any, *, references: bool) -> dict[str, list[dict[str, Any]]]:
@@ -185,6 +169,7 @@ def main() -> int:
 
     from ct_jax.checkpoint import write_json
     from ct_jax.cli import guarded, prepare_jax, print_rows
+    from ct_jax.run import provenance
 
     def run() -> None:
         options = tyro.cli(Options, description=__doc__)
@@ -192,7 +177,7 @@ def main() -> int:
         found = run_all(options)
         file = RESULTS / f"turtlebot3-{options.preset}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, {"command": " ".join(["python", *sys.argv]), **found})
+        write_json(file, {"command": provenance()["command"], **found})
         for axis, label in (("density", "density of obstacles / that of training"), ("noise", "level of noise")):
             draw_sweep(found[axis], axis, label, ROOT / "docs" / f"turtlebot3-{axis}.png")
         print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in found["rows"]])

@@ -5,16 +5,18 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from _variants import Baselines, Plan, plan_for, run_plan
-from table import room_table
+from _variants import Baselines, Plan, plan_for, run_plan, share
+from table import differences, interval_of_mean, room_table
 from turtlebot3 import variants_for
 
 from ct_envs import UserError
 from ct_jax.baselines.cql import CqlConfig
+from ct_jax.run import Run, load_mazes
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
@@ -49,6 +51,40 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path
     assert all(row["episodes"] == 4 and row["seed"] == 0 and row["variant"] == "one" for row in rows)
     monkeypatch.setattr("_variants.train_cql", None)
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
+
+
+def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_path):
+    def run(name, **changes):
+        maze = load_mazes((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],))
+        return Run(tmp_path / name, "point", "tiny", replace(tiny_settings, **changes), maze, {}, 0, "auto")
+
+    source = replace(run("source"), folder=tiny_run.folder)
+    others = {
+        "rounds": run("rounds", rounds=2),
+        "model": run("model", model=replace(tiny_settings.model, returns=False)),
+        "collect": run("collect", collect=replace(tiny_settings.collect, noise=0.1)),
+        "prm": run("prm", prm=replace(tiny_settings.prm, samples=50)),
+    }
+    taken = {"rounds": 3, "model": 2, "collect": 1, "prm": 0}
+    for name, other in others.items():
+        share(source, other)
+        stages = [stage for stage in ("controller", "collect", "fit") if other.done(stage) is not None]
+        assert stages == ["controller", "collect", "fit"][: taken[name]]
+
+
+def test_what_fine_tuning_adds_is_told_pair_by_pair():
+    def row(variant, seed, outcomes):
+        return {"variant": variant, "method": "ct", "model_seed": seed, "outcomes": outcomes}
+
+    half = "01" * 50
+    rows = {"CT": [row("published", 0, half), row("published", 1, half)],
+            "F-CT": [row("f-ct", 1, "1" * 100), row("f-ct", 0, half)]}  # fmt: skip
+    (_, line) = differences({(True, "m", name): models for name, models in rows.items()})
+    assert line.startswith("m: F-CT less CT +25.0 (+0.0 to +5")
+    with_itself = interval_of_mean(np.zeros((3, 100)))
+    assert with_itself == (0.0, 0.0)
+    low, high = interval_of_mean(np.tile([0.0, 1.0], (3, 50)))
+    assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # as a binomial's, were models alike
 
 
 def test_the_turtlebots_rows_share_what_they_can():
