@@ -81,6 +81,7 @@ class Evaluate:
       ct-jax evaluate zoo:point --maze antmaze-large-eval
       ct-jax evaluate runs/demo --maze my_floor.txt --episodes 20
       ct-jax evaluate runs/demo --method explorer --json > explorer.json
+      ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
       ct-jax evaluate runs/turtlebot3-cpu-0 --worlds 20 --pairs 25 --density 1.5 --noise 1
     """
 
@@ -104,6 +105,8 @@ class Evaluate:
     """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
     engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
+    picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Draw all episodes in the maze: a .png, .svg or .pdf file."""
     json: FlagCreatePairsOff[bool] = False
     """Print one JSON object and nothing else."""
 
@@ -288,7 +291,7 @@ def _evaluate(command: Evaluate) -> None:
         prepare_jax()
         from ct_jax import pipeline
 
-        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise")
+        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "picture")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
     if command.json:

@@ -23,6 +23,7 @@ from ct_jax.run import Run, drop_checkpoints, join_mazes, kept_row, slug, traini
 from ct_jax.trajectories import Trajectories
 
 MAX_EPISODES = 100_000
+PICTURES = (".png", ".svg", ".pdf")
 PAIR_ARRAYS = ("start", "goal", "shortest_m")
 Progress = Callable[[int, int], None]
 
@@ -144,13 +145,18 @@ def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
 
 def evaluate_in_maze(
     model: TrainedModel, method: str, seed: int, *, maze: str = "antmaze-large", episodes: int = 100,
-    engine: str = "auto",
+    engine: str = "auto", picture: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in one maze; returns its row of the table.
 
+    Args:
+        picture: file for a picture of all episodes.
+
     Raises:
-        UserError: unknown maze, or no episodes.
+        UserError: unknown maze, no episodes, or a picture that cannot be made there.
     """
+    if picture is not None and (picture.suffix not in PICTURES or not picture.parent.is_dir()):
+        raise UserError(f"--picture {picture}: give a {', '.join(PICTURES)} file in a folder that exists")
     if not 1 <= episodes <= MAX_EPISODES:
         raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
     world = load_maze(maze)
@@ -159,4 +165,10 @@ def evaluate_in_maze(
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     name = Path(maze).stem
     outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
-    return head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
+    row = head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
+    if picture is not None:
+        from ct_jax.report import pictures  # matplotlib, which takes its time
+
+        reached = f"{int(outcome.success.sum())} of {len(outcome.success)} reached the goal"
+        pictures.write_paths(picture, np.asarray(world.walls), outcome, f"{model.robot}, {method} in {name}: {reached}")
+    return row

@@ -76,10 +76,12 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
         assert row[name] == pytest.approx(whole[0][name]), name
 
 
-def test_evaluate_prints_a_table_for_people(tiny, tiny_run, capsys):
-    assert main(["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4"]) == 0
+def test_evaluate_prints_a_table_for_people(tiny, tiny_run, tmp_path, capsys):
+    arguments = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4"]
+    assert main([*arguments, "--picture", str(tmp_path / "paths.svg")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 and lines[1].split()[:2] == ["antmaze-umaze", "ct"]
+    assert "point, ct in antmaze-umaze: " in (tmp_path / "paths.svg").read_text()
 
 
 def test_report_is_written_again(tiny, tiny_run, tmp_path, capsys):
@@ -163,6 +165,8 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
         (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
         (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
+        (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
+        (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "zoo:nobody"], ["zoo:nobody", "models: zoo:"]),
         (["evaluate", "nowhere"], ["nowhere: no run folder", "ct-jax train"]),
         (["report", "nowhere"], ["nowhere"]),

@@ -11,7 +11,8 @@ import re
 from collections.abc import Iterable
 from html import escape
 from io import StringIO
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -24,6 +25,9 @@ from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, StrMethodFo
 
 from ct_envs.turtlebot3_world import World
 from ct_jax.report.reading import Place
+
+if TYPE_CHECKING:
+    from ct_jax.evaluate import Episodes
 
 LEVELS = 8  # steps of the time ramps
 LIGHT = {
@@ -229,6 +233,20 @@ def draw_paths(
         ends = np.array([tracks[i][-1] for i in np.flatnonzero(~success)])
         edge = {"edgecolors": LIGHT["card"], "linewidths": 0.6}
         ax.scatter(*ends.T, s=46 * size, marker="X", color=LIGHT["fail"], zorder=7, **edge)
+
+
+def write_paths(file: Path, walls: Place, episodes: "Episodes", title: str) -> None:
+    """Write a picture of a maze, or a room, and all episodes in it, in the format that the file's name says."""
+    width, top = 5.2, 0.3
+    height = width * aspect(walls)
+    with style():
+        figure = Figure(figsize=(width, height + top), facecolor=LIGHT["card"])
+        ax = figure.add_axes((0.0, 0.0, 1.0, height / (height + top)))
+        draw_maze(ax, walls)
+        start, goal = episodes.pairs.start, episodes.pairs.goal
+        draw_paths(ax, episodes.path, episodes.success, episodes.steps, start, goal, linewidth=0.8, size=0.6)
+        figure.text(0.5, 1 - 0.5 * top / (height + top), title, ha="center", va="center", fontsize=9)
+        figure.savefig(file, dpi=180)
 
 
 def _spacing(tracks: list[np.ndarray]) -> float:
