@@ -36,8 +36,6 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
         cells += [pooled(models, "fall")] if falls else []
         lines.append("| " + " | ".join(cells) + " |")
     lines += differences(together)
-    made = {(row["commit"], row["hardware"], row["created"][:10]) for row in rows}
-    commits, machines, days = (", ".join(sorted({m[i] for m in made})) for i in range(3))
     pairs = {(row["episodes"], row["seed"]) for row in rows}
     on = "; ".join(f"{n} pairs of seed {seed}" for n, seed in sorted(pairs))
     seeds = ", ".join(str(seed) for seed in sorted({row["model_seed"] for row in rows}))
@@ -45,8 +43,8 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     for row in rows:
         walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
     took = ", ".join(f"{variant} {np.mean(minutes):.0f} min" for variant, minutes in walls.items())
-    note = f"`{results['command']}`; {on} in each maze; models of seeds {seeds}; 95 % intervals; commit {commits}; "
-    return [*lines, "", f"{note}{machines}; {days}; a model takes: {took}."]
+    note = f"`{results['command']}`; {on} in each maze; models of seeds {seeds}; 95 % intervals; {origin(rows)}"
+    return [*lines, "", f"{note}; a model takes: {took}."]
 
 
 def method_name(row: dict[str, Any]) -> str:
@@ -106,11 +104,39 @@ def room_table(results: dict[str, Any]) -> list[str]:
         counts = [str(row[grade]) for grade in ("full", "partial", "failed")]
         lines.append("| " + " | ".join([name, f"{row['noise']:g}", *counts]) + " |")
     rows = results["rows"]
-    made = [", ".join(sorted({str(row[key])[:length] for row in rows}))
-            for key, length in (("commit", None), ("hardware", None), ("created", 10))]  # fmt: skip
     on = f"{rows[0]['worlds']} random rooms, {rows[0]['pairs']} pairs in each, of seed {rows[0]['seed']}"
-    note = f"`{results['command']}`; {on}; 95 % intervals; commit {made[0]}; {made[1]}; {made[2]}."
+    note = f"`{results['command']}`; {on}; 95 % intervals; {origin(rows)}."
     return [*lines, "", note]
+
+
+def transfer_table(results: dict[str, Any]) -> list[str]:
+    """One line for each robot and start: success after so many updates, and when 90 % of the final one was there.
+
+    The final success is the better of both starts' means after the last update.
+    """
+    rows = results["rows"]
+    marks = sorted({row["updates"] for row in rows})
+    names = ["robot", "start", *(f"{mark}" for mark in marks), "90 % of the final at"]
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    means: dict[tuple[str, str], list[float]] = {}
+    for start in dict.fromkeys((row["robot"], row["start"]) for row in rows):
+        mine = [row for row in rows if (row["robot"], row["start"]) == start]
+        means[start] = [np.mean([r["success_rate"] for r in mine if r["updates"] == mark]) for mark in marks]
+    for (robot, start), curve in means.items():
+        enough = 0.9 * max(other[-1] for (of, _), other in means.items() if of == robot)
+        reached = next((str(mark) for mark, mean in zip(marks, curve, strict=True) if mean >= enough), "later")
+        how = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
+        lines.append("| " + " | ".join([robot, how, *(f"{100 * mean:.0f}" for mean in curve), reached]) + " |")
+    seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows}))
+    on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of seeds {seeds}"
+    return [*lines, "", f"`{results['command']}`; {on}; {origin(rows)}."]
+
+
+def origin(rows: list[dict[str, Any]]) -> str:
+    """Commits, machines and days of the rows."""
+    facts = (("commit", None), ("hardware", None), ("created", 10))
+    found = [", ".join(sorted({row[key][:length] for row in rows})) for key, length in facts]
+    return f"commit {found[0]}; {found[1]}; {found[2]}"
 
 
 def pooled(rows: list[dict[str, Any]], name: str) -> str:
@@ -137,6 +163,8 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
 def _table(data: Any) -> list[str]:
     if not isinstance(data, dict):
         return benchmark_table(data)
+    if "start" in data["rows"][0]:
+        return transfer_table(data)
     return room_table(data) if "seven" in data else experiment_table(data)
 
 

@@ -86,7 +86,7 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
     pairs = draw_pairs(0, maze, options.episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     # Saved after every chunk, so that each mark goes on from the one before.
     checkpoints = Checkpoints(folder / "checkpoints", every_s=0.0)
-    rows = []
+    rows, made = [], provenance()
     with Bar(str(folder.relative_to(options.out)), max(options.marks)) as bar:
         for mark in sorted(options.marks):
             file = folder / f"{mark}.json"
@@ -97,9 +97,8 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
                 )  # fmt: skip
                 policy = replace(target.model.policy, params=params_now)
                 episodes = evaluate(target.env, maze, pairs, "ct", policy=policy)
-                write_json(
-                    file, {"updates": mark, "maze": unseen[0], "episodes": options.episodes} | episodes.summary()
-                )
+                row = {"updates": mark, "maze": unseen[0], "episodes": options.episodes} | episodes.summary()
+                write_json(file, row | {name: made[name] for name in ("commit", "hardware", "created")})
             rows.append(read_json(file))
     checkpoints.close()
     return rows
@@ -109,7 +108,6 @@ def measure(options: Options) -> list[dict[str, Any]]:
     """All curves' rows."""
     runs = {"point": options.point, "ant": options.ant}
     make = functools.cache(lambda robot: Target.of(runs[robot], max(options.marks)))
-    made = {name: value for name, value in provenance().items() if name in ("commit", "hardware", "created")}
     rows = []
     for robot, other in (("ant", "point"), ("point", "ant")):
         for seed in options.seeds:
@@ -118,7 +116,7 @@ def measure(options: Options) -> list[dict[str, Any]]:
                 folder = options.out / robot / f"{start}-{seed}"
                 folder.mkdir(parents=True, exist_ok=True)
                 head = {"robot": robot, "start": other if source else "scratch", "seed": seed}
-                rows += [head | row | made for row in curve(make(robot), source, seed, options, folder)]
+                rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
     return rows
 
 
@@ -148,7 +146,7 @@ def main(options: Options) -> None:
     prepare_jax()
     rows = measure(options)
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    write_json(RESULTS, {"command": " ".join(["python", *sys.argv]), "rows": rows})
+    write_json(RESULTS, {"command": provenance()["command"], "rows": rows})
     draw(rows, PICTURE)
     print(f"results: {RESULTS}\npicture: {PICTURE}")
 

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Baselines, Plan, plan_for, run_plan, share
-from table import differences, interval_of_mean, room_table
+from table import differences, interval_of_mean, room_table, transfer_table
 from turtlebot3 import variants_for
 
 from ct_envs import UserError
@@ -113,3 +113,16 @@ def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
     lines = room_table({"command": "python", "rows": rows, "density": sweep, "noise": rows, "seven": seven})
     assert [line.split(" | ")[3] for line in lines[2:4]] == ["95.0 (93 to 96)", "80.0 (76 to 83)"]
     assert "ct, 2 models" in lines[2] and any("| 60 | 5 | 5 |" in line for line in lines)
+
+
+def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
+    made = {"commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00", "episodes": 100}
+    curves = {("scratch", 0): (0.0, 0.2, 0.8), ("scratch", 1): (0.0, 0.4, 1.0), ("ant", 0): (0.5, 0.85, 0.9)}
+    rows = [
+        {"robot": "point", "start": start, "seed": seed, "updates": mark, "success_rate": rate} | made
+        for (start, seed), curve in curves.items()
+        for mark, rate in zip((25, 50, 100), curve, strict=True)
+    ]
+    lines = transfer_table({"command": "python", "rows": rows})
+    assert lines[2] == "| point | from scratch | 0 | 30 | 90 | 100 |"
+    assert lines[3] == "| point | from the ant's trunk | 50 | 85 | 90 | 50 |"
