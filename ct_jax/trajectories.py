@@ -150,7 +150,7 @@ def sample_windows(
     shift_timestep: int = 0,
     overhang: int = 0,
 ) -> Window:
-    """Draw pieces of ``steps`` steps: a trajectory by its length, and any of its whole pieces alike.
+    """Draw pieces of ``steps`` steps: a trajectory by its length, and of it no step less often than another.
 
     Args:
         rtg: ``trajectories.rtg``, computed once.
@@ -163,9 +163,11 @@ def sample_windows(
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
-    # pieces may begin at any step that leaves them full, or at the start of a short trajectory
-    places = jnp.maximum(length + overhang - steps, 0) + 1
-    first = (jax.random.uniform(where_key, (batch,)) * places).astype(jnp.int32)
+    # Pieces may begin at any step that leaves them full, or at the start of a short trajectory. Those that would hang
+    # over an end are moved inside: else first and last steps would be in one piece of many that hold a middle one.
+    last, beyond = jnp.maximum(length + overhang - steps, 0), steps - 1 - overhang
+    drawn = jax.random.uniform(where_key, (batch,)) * (last + 1 + 2 * beyond)
+    first = jnp.clip(drawn.astype(jnp.int32) - beyond, 0, last)
     at = first[:, None] + jnp.arange(steps)[None]
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)

@@ -128,6 +128,13 @@ def test_each_step_can_be_part_of_a_piece(toy_data):
     np.testing.assert_allclose(share, data.length / data.length.sum(), atol=0.04)
 
 
+def test_first_and_last_steps_are_learned_as_often_as_others(toy_data):
+    data = toy_data([40])
+    window = windows(data, steps=8, batch=4000)
+    counts = np.bincount(which_step(window, data)[1].ravel(), minlength=40)
+    assert counts[[0, -1]].min() > 0.9 * counts[8:-8].mean() and window.valid.all()
+
+
 def test_shifted_timesteps_keep_their_pace(toy_data):
     data = toy_data([30])
     plain, shifted = windows(data), windows(data, shift_timestep=9)
