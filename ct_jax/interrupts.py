@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_CALLBACKS = "jax._src.callback"
+_CALLBACKS = ("ct_envs.host_call", "jax._src.callback")
 
 
 class Terminated(KeyboardInterrupt):
@@ -54,7 +54,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 def _in_callback(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_globals.get("__name__") == _CALLBACKS:
+        if frame.f_globals.get("__name__") in _CALLBACKS:
             return True
         frame = frame.f_back
     return False
