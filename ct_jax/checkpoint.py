@@ -1,9 +1,14 @@
-"""What is kept on disk: Orbax for training states, safetensors for weights that are shipped. Nothing is unpickled."""
+"""What is kept on disk: Orbax for training states, safetensors for weights that are shipped. Nothing is unpickled.
 
+Both carry SHA-256 sums, and are checked against them before they are trusted.
+"""
+
+import hashlib
 import json
 import shutil
+import sys
+import threading
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,51 +16,103 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from ct_envs import UserError
+from ct_jax.interrupts import rescued_by, uninterrupted
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
-_DISK_ERRORS = ("RESOURCE_EXHAUSTED", "PERMISSION_DENIED", "No space left")
+MANIFEST = "SHA256SUMS"  # as ``sha256sum -c`` reads it
+_DISK_ERRORS = {  # by what is in tensorstore's message
+    "RESOURCE_EXHAUSTED": "no space left", "No space left": "no space left", "PERMISSION_DENIED": "no permission",
+    "Error writing": "writing fails",
+}  # fmt: skip
 
 
 def _is_key(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
+def _disk_error(error: ValueError) -> str:
+    """What is wrong with the disk, if anything: tensorstore has one exception for all its errors."""
+    return next((words for sign, words in _DISK_ERRORS.items() if sign in str(error)), "")
+
+
+def _write_manifest(folder: Path) -> None:
+    """Write the sums of all files in a folder, beside them."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    lines = [f"{_sum(file)}  {file.relative_to(folder).as_posix()}\n" for file in files]
+    (folder / MANIFEST).write_text("".join(lines), "utf-8")
+
+
+def _check_manifest(folder: Path) -> None:
+    """Raise ValueError unless every file is as it was written, or OSError where one is missing."""
+    for line in (folder / MANIFEST).read_text("utf-8").splitlines():
+        wanted, _, name = line.partition("  ")
+        if _sum(folder / name) != wanted:
+            raise ValueError(f"{name} is not as it was written")
+
+
+def _sum(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+class _Handler(ocp.StandardCheckpointHandler):
+    """Orbax's, with a manifest; it is there before the checkpoint gets its name, so that none is ever without."""
+
+    def finalize(self, directory: Any) -> None:
+        super().finalize(directory)
+        _write_manifest(Path(directory))
+
+
+@ocp.args.register_with_handler(_Handler, for_save=True)
+class _Save(ocp.args.StandardSave):
+    pass
+
+
+@ocp.args.register_with_handler(_Handler, for_restore=True)
+class _Restore(ocp.args.StandardRestore):
+    pass
+
+
 class Checkpoints:
     """The last states of a training, in a folder of their own; a state is a pytree of arrays."""
 
-    def __init__(self, folder: Path, *, keep: int = 2, every_s: float = SAVE_EVERY_S):
+    def __init__(self, folder: Path, *, keep: int = 2, every_s: float | None = None):
         """
         Args:
             keep: how many states stay on disk.
-            every_s: ``maybe_save`` saves when the last save is older than this [s].
+            every_s: ``maybe_save`` saves when the last save is older than this [s]; by default ``SAVE_EVERY_S``.
         """
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
+        options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self._folder = folder.resolve()
-        self._manager = ocp.CheckpointManager(self._folder, options=options)
-        self._every_s, self._last = every_s, time.monotonic()
+        self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=_Handler())
+        self._every_s, self._last = SAVE_EVERY_S if every_s is None else every_s, time.monotonic()
+        self._lock = threading.Lock()  # see ``rescued_by``
 
     def save(self, step: int, state: Any) -> None:
-        """Write a state and wait until it is on disk. Raises UserError if the disk is full or may not be written to."""
-        if step in self._manager.all_steps():
-            return
+        """Write a state and wait until it is on disk; a signal waits, too. Raises UserError if it cannot be written:
+        what was saved before stays."""
         plain = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
         leaves = {str(i): leaf for i, leaf in enumerate(jax.tree.leaves(plain))}
-        try:
-            self._manager.save(step, args=ocp.args.StandardSave(leaves))  # pyright: ignore[reportCallIssue]
-            self._manager.wait_until_finished()
-        except ValueError as bad:  # as tensorstore calls a full disk
-            if not any(word in str(bad) for word in _DISK_ERRORS):
-                raise
-            reason = "no permission" if "PERMISSION" in str(bad) else "no space left"
-            raise UserError(
-                f"{self._folder}: cannot be written ({reason}); make room, then go on with --resume"
-            ) from None
-        self._last = time.monotonic()
+        with self._lock, uninterrupted():
+            if step in self._manager.all_steps():
+                return
+            try:
+                self._manager.save(step, args=_Save(leaves))  # pyright: ignore[reportCallIssue]
+            except (ValueError, OSError) as bad:
+                for half in self._folder.glob("*.orbax-checkpoint-tmp"):
+                    shutil.rmtree(half, ignore_errors=True)
+                reason = bad.strerror if isinstance(bad, OSError) else _disk_error(bad)
+                if not reason:
+                    raise
+                raise UserError(
+                    f"{self._folder}: cannot be written ({reason}); make room, then go on with --resume"
+                ) from None
+            self._last = time.monotonic()
 
     def maybe_save(self, step: int, state: Any) -> None:
         """Save if the last time is long enough ago."""
@@ -65,23 +122,24 @@ class Checkpoints:
     def restore(self, like: Tree) -> tuple[int, Tree] | None:
         """(step, state) of the newest whole checkpoint, with the structure of ``like``; None where there is none.
 
-        A damaged one is deleted with a warning, and the one before it is taken.
+        A damaged one is put aside with a warning on stderr, and the one before it is taken.
         """
         for step in sorted(self._manager.all_steps(), reverse=True):
+            folder = self._folder / str(step)
             try:
+                _check_manifest(folder / "default")  # as Orbax calls what is saved without a name
                 return step, self._read(step, like)
             except (ValueError, KeyError, OSError) as bad:
-                folder = self._folder / str(step)
                 reason = " ".join(str(bad).split())[:200]
-                warnings.warn(f"{folder}: damaged checkpoint left out ({reason})", stacklevel=2)
-                shutil.rmtree(folder, ignore_errors=True)
+                print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
+                folder.rename(folder.with_name(f"damaged-{step}-{time.time_ns()}"))
                 self._manager.reload()
         return None
 
     def _read(self, step: int, like: Tree) -> Tree:
         leaves, structure = jax.tree.flatten(like)
         plain = {str(i): jax.random.key_data(leaf) if _is_key(leaf) else leaf for i, leaf in enumerate(leaves)}
-        found: Any = self._manager.restore(step, args=ocp.args.StandardRestore(plain))  # pyright: ignore[reportCallIssue]
+        found: Any = self._manager.restore(step, args=_Restore(plain))  # pyright: ignore[reportCallIssue]
         values = [
             jax.random.wrap_key_data(found[str(i)]) if _is_key(leaf) else found[str(i)] for i, leaf in enumerate(leaves)
         ]
@@ -115,17 +173,23 @@ def run_to(
     if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
         state = found[1]
     done = count(state)
-    try:
-        while done < total:
-            state, report = train(state, min(chunk, total - done))
-            done = count(state)
-            on_progress(done, jax.tree.map(float, report))
-            if checkpoints is not None:
-                checkpoints.maybe_save(done, state)
-    except KeyboardInterrupt:
+
+    def save() -> None:
         if checkpoints is not None:
-            checkpoints.save(done, state)
-        raise
+            checkpoints.save(count(state), state)
+
+    with rescued_by(save):
+        try:
+            while done < total:
+                after, report = train(state, min(chunk, total - done))
+                report = jax.tree.map(float, report)  # waits for it: ``state`` is always one that can be saved
+                state, done = after, count(after)
+                on_progress(done, report)
+                if checkpoints is not None:
+                    checkpoints.maybe_save(done, state)
+        except KeyboardInterrupt:
+            save()
+            raise
     return state
 
 
@@ -140,15 +204,23 @@ def save_weights(file: Path, tree: Any) -> None:
         UserError: the disk is full or may not be written to.
     """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
+    arrays = {_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}
     part = file.with_name(file.name + ".part")
     try:
-        save_file({_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}, part)
+        save_file(arrays, part, metadata={"sha256": _sum_of_arrays(arrays)})
     except SafetensorError as bad:
         part.unlink(missing_ok=True)
         raise UserError(
             f"{file}: cannot be written ({_text(bad)}); free some space and continue with --resume"
         ) from None
     part.replace(file)
+
+
+def _sum_of_arrays(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it anew") -> Tree:
@@ -161,9 +233,12 @@ def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it
         UserError: no safetensors file, a damaged one, or one of other weights (both shapes are shown).
     """
     try:
-        found = load_file(file)
+        with safe_open(file, framework="np") as opened:
+            found, said = {name: opened.get_tensor(name) for name in opened.keys()}, opened.metadata() or {}  # noqa: SIM118
     except (OSError, SafetensorError) as bad:
         raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {mend}") from None
+    if said.get("sha256", wanted := _sum_of_arrays(found)) != wanted:  # older files have none
+        raise UserError(f"{file}: not as it was written (SHA-256); {mend}")
 
     def take(path: tuple[Any, ...], leaf: Any) -> np.ndarray:
         name = _name(path)

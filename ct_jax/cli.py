@@ -147,7 +147,7 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
         go_on: what a person whose Ctrl-C stopped it should know.
     """
     try:
-        with interruptible():
+        with interruptible(f"stopped; {go_on}"):
             action()
             sys.stdout.flush()
         return 0

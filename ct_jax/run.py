@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -107,8 +107,7 @@ class Run:
 @contextmanager
 def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[dict[str, Any]]:
     """A training's bar, metrics, and checkpoints in the folder: its ``on_progress`` and ``checkpoints``."""
-    with Bar(name, total) as bar:
-        checkpoints = Checkpoints(folder / f"checkpoints-{name}")
+    with Bar(name, total) as bar, closing(Checkpoints(folder / f"checkpoints-{name}")) as checkpoints:
 
         def on_progress(done: int, report: float | dict[str, float]) -> None:
             values = report if isinstance(report, dict) else {"loss": report}
@@ -117,7 +116,6 @@ def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[
             bar.update(done, f"{shown} {values[shown]:.4g}" if shown else "")
 
         yield {"on_progress": on_progress, "checkpoints": checkpoints}
-        checkpoints.close()
 
 
 def drop_checkpoints(folder: Path) -> None:

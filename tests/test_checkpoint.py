@@ -1,7 +1,14 @@
 """What is kept on disk comes back as it was, or with an error that says which file and why."""
 
+import errno
 import json
+import os
 import pickle
+import resource
+import shutil
+import signal
+import subprocess
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +19,7 @@ from flax import struct
 from ct_envs import UserError
 from ct_jax import checkpoint
 from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
+from ct_jax.interrupts import Terminated, interruptible
 
 
 @struct.dataclass
@@ -77,6 +85,112 @@ def test_it_saves_now_and_then(tmp_path, monkeypatch):
     kept.close()
 
 
+def saved(folder, *steps, size=1000):
+    """Checkpoints of these steps; each state holds its step many times."""
+    kept = Checkpoints(folder)
+    for step in steps:
+        kept.save(step, {"a": np.full(size, step, np.float32)})
+    kept.close()
+
+
+def restored(folder, size=1000):
+    """The newest state that is whole, as (step, its numbers)."""
+    kept = Checkpoints(folder)
+    found = kept.restore({"a": np.zeros(size, np.float32)})
+    kept.close()
+    return found and (found[0], set(np.asarray(found[1]["a"]).tolist()))
+
+
+def one_bit(file):
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+DAMAGES = {
+    "one bit": one_bit,
+    "half": lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2]),
+    "missing": lambda file: file.unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_whatever_happens_to_a_file_the_one_before_is_taken(tmp_path, damage, capsys):
+    """Each file of the newest checkpoint in turn, the manifest too; one line says so, and training can go on."""
+    saved(tmp_path / "first", 1, 2)
+    state = tmp_path / "first" / "2" / "default"
+    manifest = (state / checkpoint.MANIFEST).read_text()
+    files = [line.partition("  ")[2] for line in manifest.splitlines()] + [checkpoint.MANIFEST]
+    assert len(files) > 3 and sum((state / file).stat().st_size for file in files) > 1000
+    for number, file in enumerate(files):
+        folder = Path(shutil.copytree(tmp_path / "first", tmp_path / str(number)))
+        DAMAGES[damage](folder / "2" / "default" / file)
+        capsys.readouterr()
+        assert restored(folder) == (1, {1.0}), file
+        err = capsys.readouterr().err
+        assert err.startswith(f"warning: {folder / '2'}: damaged checkpoint") and err.count("\n") == 1
+    saved(folder, 2)
+    assert restored(folder) == (2, {2.0})
+
+
+def test_where_none_is_whole_training_begins_anew(tmp_path, capsys):
+    saved(tmp_path, 1, 2)
+    for step in (1, 2):
+        one_bit(tmp_path / str(step) / "default" / checkpoint.MANIFEST)
+    assert restored(tmp_path) is None
+    assert capsys.readouterr().err.count("warning: ") == 2
+
+
+def test_the_manifest_is_one_that_other_tools_read(tmp_path):
+    saved(tmp_path, 1)
+    checked = subprocess.run(
+        ["sha256sum", "--check", "--strict", checkpoint.MANIFEST], cwd=tmp_path / "1" / "default", capture_output=True
+    )
+    assert checked.returncode == 0, checked.stderr
+
+
+@pytest.mark.parametrize("limit", [0, 300, 10_000, 100_000])
+def test_a_disk_that_fills_up_leaves_what_was_saved(tmp_path, limit):
+    """No file may grow beyond a limit: what the system then says is what it says of a full disk, but for the number."""
+    saved(tmp_path, 1)
+    kept = Checkpoints(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        with pytest.raises(UserError, match=r"cannot be written \(.*--resume"):
+            kept.save(2, {"a": np.random.default_rng(0).random(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        kept.close()
+    assert restored(tmp_path) == (1, {1.0})
+    assert [path.name for path in tmp_path.iterdir()] == ["1"]
+
+
+@pytest.mark.parametrize("failing", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_called_so(tmp_path, failing, monkeypatch):
+    def full(folder):
+        raise OSError(failing, os.strerror(failing), str(folder))
+
+    monkeypatch.setattr(checkpoint, "_write_manifest", full)
+    with pytest.raises(UserError, match=rf"{tmp_path.name}: cannot be written \({os.strerror(failing)}\)"):
+        saved(tmp_path, 1)
+    monkeypatch.undo()
+    assert restored(tmp_path) is None
+
+
+def test_a_signal_waits_for_what_is_being_saved(tmp_path, monkeypatch):
+    write = checkpoint._write_manifest
+
+    def signalled(folder):
+        os.kill(os.getpid(), signal.SIGTERM)
+        write(folder)
+
+    monkeypatch.setattr(checkpoint, "_write_manifest", signalled)
+    with pytest.raises(Terminated), interruptible():
+        saved(tmp_path, 1)
+    assert restored(tmp_path) == (1, {1.0})
+
+
 # ---------------------------------------------------------------------------------------------------- weights
 
 TREE = {
@@ -103,12 +217,13 @@ def test_other_weights_are_refused_with_both_shapes(tmp_path):
         load_weights(file, {"layer": {"scale": jnp.ones(3)}})
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "half", "pickle", "text"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "half", "pickle", "text", "one bit"])
 def test_damaged_weights_are_refused(tmp_path, damage):
     file = tmp_path / "w.safetensors"
     save_weights(file, TREE)
     whole = file.read_bytes()
-    content = {"empty": b"", "half": whole[: len(whole) // 2], "text": b"no weights at all"}
+    flipped = whole[:-1] + bytes([whole[-1] ^ 1])  # the last number
+    content = {"empty": b"", "half": whole[: len(whole) // 2], "text": b"no weights at all", "one bit": flipped}
     if damage == "missing":
         file.unlink()
     elif damage == "pickle":
