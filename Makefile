@@ -11,10 +11,10 @@ PIP_TOOLS := pip-tools==7.6.2
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check format bench lock clean
+.PHONY: help setup demo test test-resume check format bench lock clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(READY) ## Create .venv with the locked packages and this project in it
 
@@ -38,6 +38,9 @@ demo: setup ## Train and evaluate a small Control Transformer on the point robot
 test: setup ## Run the tests (ARGS="-k maze" to choose, WORKERS=8 for more processes)
 	@echo "Running the tests in $(WORKERS) processes"
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+
+test-resume: setup ## Kill runs twenty times; each must end like one that nothing stopped (minutes)
+	@$(BIN)/python -m pytest -m long $(ARGS) tests/test_resume.py
 
 check: setup ## Lint, check the formatting and the types
 	@echo "ruff: lint"

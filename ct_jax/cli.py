@@ -221,26 +221,24 @@ def _reason(text: str) -> str:
 
 
 def prepare_jax() -> None:
-    """One CPU device a core, exact float32 products, and a private cache of compiled programs."""
+    """One CPU device a core, exact float32 products, and compiled programs that are kept."""
     with contextlib.redirect_stdout(io.StringIO()):  # MJX says that warp, which we do not use, is missing
         import jax
 
         import ct_jax.pipeline  # noqa: F401
+        from ct_jax.compilation import keep_programs
         from ct_jax.run import cores
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs what it also raises, in hundreds of lines
     # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ct-jax" / "compiled"
-    with contextlib.suppress(OSError):
-        cache.mkdir(parents=True, exist_ok=True)
-        cache.chmod(0o700)  # compiled programs are code: nobody else may put one here
-        if not jax.config.values["jax_compilation_cache_dir"]:
-            jax.config.update("jax_compilation_cache_dir", str(cache))
+    keep_programs()
     try:
         jax.devices()
     except RuntimeError as bad:
         raise UserError(f"jax finds no device ({bad}); set JAX_PLATFORMS=cpu or install its plugin") from None
+    # XLA has a page of doubts about each program that it did not compile itself; what fails is raised besides.
+    jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _train(command: Train) -> None:

@@ -19,7 +19,7 @@ from ct_jax.model import TrainedModel, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
-from ct_jax.run import Run, drop_checkpoints, join_mazes, kept_row, slug, training
+from ct_jax.run import Run, join_mazes, kept_row, slug, training
 from ct_jax.trajectories import Trajectories
 
 MAX_EPISODES = 100_000
@@ -49,7 +49,6 @@ class MazeCourse:
                 )
             save_controller(folder, run.robot, config, controller, run.made | {"held_out_success": held_out})
             info |= {"held_out_success": held_out}
-        drop_checkpoints(folder)
         return controller, config
 
     def collect(self, key: jax.Array, controller: SacController, folder: Path, on_progress: Progress) -> Trajectories:

@@ -6,7 +6,6 @@ interrupted one has finished is kept. What differs between mazes and rooms is as
 
 import functools
 import inspect
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from ct_jax.model import TrainedModel, blank_model, load_model, save_model
 from ct_jax.policy import TransformerPolicy
 from ct_jax.progress import Bar, Metrics
 from ct_jax.rooms import RoomCourse, evaluate_in_rooms
-from ct_jax.run import Run, drop_checkpoints, open_run, training
+from ct_jax.run import Run, drop_leftovers, open_run, training
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
 from ct_jax.value import ValueNetwork
@@ -107,13 +106,11 @@ def _collect(run: Run, course: Course, controller: Any) -> Trajectories:
     if run.done("collect") is not None:
         return _read_trajectories(run, file)
     with run.stage("collect") as (_, info), Bar("collect", run.settings.collect.trajectories) as bar:
-        waves = file.parent / "waves"
         data = course.collect(
-            run.key("collect"), controller, waves,
+            run.key("collect"), controller, file.parent / "waves",
             lambda successes, episodes: bar.update(successes, f"of {episodes} episodes"),
         )  # fmt: skip
         storage.save(data, file)
-        shutil.rmtree(waves, ignore_errors=True)
         info |= describe(data)
     return data
 
@@ -137,10 +134,9 @@ def _fit(run: Run, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
     policy, _ = blank_model(run.robot, run.settings)
     if run.done("fit") is not None:
         return _fit_both(run, "fit", 0, policy, data, metrics)
-    with run.stage("fit") as (folder, info):
+    with run.stage("fit") as (_, info):
         policy = _fit_both(run, "fit", 0, policy, data, metrics)
         info |= {"parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params))}
-    drop_checkpoints(folder)
     return policy
 
 
@@ -203,7 +199,7 @@ def _finetune(
         for number in range(1, run.settings.rounds + 1):
             data = storage.concatenate([data, _recoveries(run, course, number, policy, controller)])
             policy = _fit_both(run, "finetune", number, policy, data, metrics)
-            drop_checkpoints(folder)
+            drop_leftovers(folder)
         info |= {"rounds": run.settings.rounds} | describe(data)
     return policy
 
@@ -214,15 +210,13 @@ def _recoveries(run: Run, course: Course, number: int, policy: TransformerPolicy
     if file.is_file():
         return _read_trajectories(run, file)
     with Bar(f"recover-{number}", run.settings.recover.recoveries) as bar:
-        waves = file.parent / f"waves-{number}"
         found = course.recover(
-            jax.random.fold_in(run.key("finetune"), number), policy, controller, waves,
+            jax.random.fold_in(run.key("finetune"), number), policy, controller, file.parent / f"waves-{number}",
             lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
         )  # fmt: skip
     part = file.with_name("part-" + file.name)
     storage.save(found, part)
     part.replace(file)
-    shutil.rmtree(waves, ignore_errors=True)
     return found
 
 

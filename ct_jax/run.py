@@ -99,6 +99,7 @@ class Run:
             raise
         write_json(folder / "done.json", info | {"wall_s": round(before + time.perf_counter() - begun, 2)})
         file.unlink(missing_ok=True)
+        drop_leftovers(folder)
 
 
 # ------------------------------------------------------------------------------------------- trainings and results
@@ -118,9 +119,9 @@ def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[
         yield {"on_progress": on_progress, "checkpoints": checkpoints}
 
 
-def drop_checkpoints(folder: Path) -> None:
-    """Delete what only an interrupted training needs."""
-    for left in folder.glob("checkpoints-*"):
+def drop_leftovers(folder: Path) -> None:
+    """Delete what only an interrupted stage needs."""
+    for left in (*folder.glob("checkpoints-*"), *folder.glob("waves*")):
         shutil.rmtree(left, ignore_errors=True)
 
 
@@ -230,6 +231,9 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
     with _locked(run.folder):
         if not config.is_file():
             write_json(config, identity(run) | provenance())
+        for stage in STAGES:  # a process may have been killed between a stage's end and its tidying up
+            if run.done(stage) is not None:
+                drop_leftovers(run.folder / stage)
         yield
 
 

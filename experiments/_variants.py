@@ -28,7 +28,7 @@ from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
     default_mazes,
-    drop_checkpoints,
+    drop_leftovers,
     episodes_file,
     join_mazes,
     load_mazes,
@@ -229,7 +229,7 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
             learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
         metrics.close()
         save_weights(file, learned.params)
-        drop_checkpoints(folder)
+        drop_leftovers(folder)
     policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
     mazes = join_mazes(run.mazes, run.eval_mazes).items()
     rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]

@@ -8,6 +8,7 @@ import dataclasses
 import fcntl
 import io
 import json
+import multiprocessing
 import os
 from pathlib import Path
 
@@ -62,6 +63,20 @@ def jit_disabled():
     """Runs the test operation by operation, so that asserts and Python errors inside jitted code are seen."""
     with jax.disable_jit():
         yield
+
+
+@pytest.fixture(scope="session")
+def fork():
+    """Starts functions in processes that have everything imported, and have not begun with JAX."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["ct_jax.pipeline", "ct_jax.report", "ct_envs.turtlebot3_pool"])
+
+    def start(target, *arguments):
+        process = context.Process(target=target, args=arguments)
+        process.start()
+        return process
+
+    return start
 
 
 @pytest.fixture(scope="session")

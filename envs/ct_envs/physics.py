@@ -156,7 +156,7 @@ class MujocoEngine:
         host_call.register(self._name, lambda inputs, after: np.copyto(after, self._step(inputs)))
 
     def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
-        # One array each way: every further one costs a call as much as the physics of ten robots.
+        # One array each way: every further one costs a call as much as the physics of some robots.
         inputs = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl, walls.ravel()])
         nq, nv = self.model.nq, self.model.nv
         shape = jax.ShapeDtypeStruct((nq + 2 * nv + WALLS,), inputs.dtype)

@@ -1,0 +1,46 @@
+"""Compiled programs are kept from one process to the next, in a folder that nobody else can write to.
+
+``JAX_COMPILATION_CACHE_DIR`` names another folder, and ``JAX_ENABLE_COMPILATION_CACHE=0`` keeps nothing.
+"""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+
+def keep_programs() -> None:
+    """Keep every program, however quickly it compiles: a run has hundreds. Where no private folder can be had, none."""
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    if jax.config.values["jax_compilation_cache_dir"]:
+        return
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        home.mkdir(parents=True, exist_ok=True)
+        folder = home / "ct-jax" / f"compiled-{_processor()}"
+        private = all([_make_private(each) for each in (folder.parent, folder)])
+    except (OSError, RuntimeError):  # no home, or none that can be written to
+        return
+    if private:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def _make_private(folder: Path) -> bool:
+    """Make a folder for this user alone. False where somebody else made it: compiled programs are code."""
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.stat().st_uid != os.getuid():
+        return False
+    folder.chmod(0o700)
+    return True
+
+
+def _processor() -> str:
+    """What this processor can do, in short: machines that share a home must not share programs for the CPU."""
+    can = platform.machine() + platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        lines = info.read_text("utf-8", "replace").splitlines()
+        can += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(can.encode()).hexdigest()[:12]

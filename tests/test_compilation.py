@@ -1,0 +1,117 @@
+"""Everything compiles once: once in a process, and once for all the processes of a user."""
+
+import json
+import os
+import stat
+import sys
+from collections import Counter
+
+import jax
+import numpy as np
+import pytest
+
+from ct_envs import MazeEnv, load_maze
+from ct_envs.maze import sample_pair
+from ct_jax import compilation
+from ct_jax.evaluate import Pairs, evaluate
+from ct_jax.model import load_model
+from ct_jax.rollout import rollout
+
+pytestmark = pytest.mark.rank_promotion("allow")
+
+FOLDER = "jax_compilation_cache_dir"
+
+
+def count(arguments, home, file):
+    """A command in a process of its own; writes down how many programs it asked for, and how many were there."""
+    from ct_jax import cli
+
+    os.environ["XDG_CACHE_HOME"] = str(home)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    seen = Counter()
+    jax.monitoring.register_event_listener(lambda name, **_: seen.update([name.rpartition("/")[2]]))
+    status = cli.main(arguments)
+    file.write_text(json.dumps([seen["compile_requests_use_cache"], seen["cache_hits"]]))
+    sys.exit(status)
+
+
+def counts(fork, arguments, tmp_path):
+    process = fork(count, arguments, tmp_path / "home", tmp_path / "counts.json")
+    process.join()
+    assert process.exitcode == 0
+    return json.loads((tmp_path / "counts.json").read_text())
+
+
+def test_the_same_command_again_compiles_nothing(fork, tiny_run, tmp_path):
+    """Programs that step MuJoCo, too; and nobody else can get at them."""
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2"]
+    asked, there = counts(fork, command, tmp_path)
+    assert there < asked
+    again, there = counts(fork, command, tmp_path)
+    assert again == there > 10
+    folders = [path for path in (tmp_path / "home").rglob("*") if path.is_dir()]
+    assert folders and {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
+
+
+def test_acting_compiles_once_for_all_mazes(tiny_run, islands):
+    model, env = load_model(str(tiny_run.folder)), MazeEnv("point", engine="mujoco", auto_reset=False, horizon=20)
+    before = rollout._cache_size()
+    for name in (str(islands), "antmaze-umaze", "unseen-rooms"):
+        maze = load_maze(name)
+        draw = jax.vmap(lambda key, maze=maze: sample_pair(key, maze, radius=0.5))
+        start, goal = map(np.asarray, draw(jax.random.split(jax.random.key(0), 2)))
+        evaluate(env, maze, Pairs(start, goal, np.ones(2), 0), "ct", policy=model.policy)
+    assert rollout._cache_size() == before + 1
+
+
+# ------------------------------------------------------------------------------------------------- the folder
+
+
+@pytest.fixture
+def kept(monkeypatch, tmp_path):
+    """Calls ``keep_programs`` with nothing configured; the folder that it chooses, and the home it should be in."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+
+    def keep():
+        chosen = {FOLDER: None}
+        with monkeypatch.context() as patch:
+            patch.setattr(compilation.jax, "config", type("Config", (), {"values": chosen, "update": chosen.__setitem__}))
+            compilation.keep_programs()
+        return chosen[FOLDER]
+
+    return keep
+
+
+def test_the_folder_becomes_private(kept, tmp_path):
+    home = tmp_path / "home" / "ct-jax"
+    home.mkdir(parents=True, mode=0o777)
+    home.chmod(0o777)
+    folder = kept()
+    assert folder.startswith(str(home)) and kept() == folder
+    assert stat.S_IMODE(home.stat().st_mode) == stat.S_IMODE(os.stat(folder).st_mode) == 0o700
+
+
+def test_a_folder_of_somebody_else_is_not_used(kept, monkeypatch):
+    monkeypatch.setattr(compilation.os, "getuid", lambda: os.geteuid() + 1)
+    assert kept() is None
+
+
+def test_a_home_that_cannot_be_written_to_is_no_error(kept, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    assert kept() is None
+
+
+def test_other_processors_have_other_folders(kept, monkeypatch):
+    ours = kept()
+    monkeypatch.setattr(compilation, "_processor", lambda: "another")
+    assert kept() != ours
+
+
+def test_a_folder_that_was_named_stays():
+    before = jax.config.values[FOLDER]
+    quickest = jax.config.jax_persistent_cache_min_compile_time_secs
+    try:
+        compilation.keep_programs()
+        assert before and jax.config.values[FOLDER] == before
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", quickest)
