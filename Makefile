@@ -40,7 +40,7 @@ test: setup ## Run the tests (ARGS="-k maze" to choose, WORKERS=8 for more proce
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 test-resume: setup ## Kill runs twenty times; each must end like one that nothing stopped (minutes)
-	@$(BIN)/python -m pytest -m long $(ARGS) tests/test_resume.py
+	@$(BIN)/python -m pytest -m long $(ARGS) tests/test_resume.py tests/test_compilation.py
 
 check: setup ## Lint, check the formatting and the types
 	@echo "ruff: lint"

@@ -5,6 +5,8 @@ import os
 import stat
 import sys
 from collections import Counter
+from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -22,10 +24,13 @@ pytestmark = pytest.mark.rank_promotion("allow")
 FOLDER = "jax_compilation_cache_dir"
 
 
-def count(arguments, home, file):
+def count(arguments, settings, home, file):
     """A command in a process of its own; writes down how many programs it asked for, and how many were there."""
-    from ct_jax import cli
+    from ct_envs import robots
+    from ct_jax import cli, presets
 
+    robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
+    presets.PRESETS["tiny"] = settings
     os.environ["XDG_CACHE_HOME"] = str(home)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     seen = Counter()
@@ -35,22 +40,32 @@ def count(arguments, home, file):
     sys.exit(status)
 
 
-def counts(fork, arguments, tmp_path):
-    process = fork(count, arguments, tmp_path / "home", tmp_path / "counts.json")
+def counts(fork, arguments, settings, tmp_path):
+    process = fork(count, arguments, settings, tmp_path / "home", tmp_path / "counts.json")
     process.join()
     assert process.exitcode == 0
     return json.loads((tmp_path / "counts.json").read_text())
 
 
-def test_the_same_command_again_compiles_nothing(fork, tiny_run, tmp_path):
+def test_the_same_command_again_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
     """Programs that step MuJoCo, too; and nobody else can get at them."""
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2"]
-    asked, there = counts(fork, command, tmp_path)
+    asked, there = counts(fork, command, tiny_settings, tmp_path)
     assert there < asked
-    again, there = counts(fork, command, tmp_path)
+    again, there = counts(fork, command, tiny_settings, tmp_path)
     assert again == there > 10
     folders = [path for path in (tmp_path / "home").rglob("*") if path.is_dir()]
     assert folders and {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
+
+
+@pytest.mark.long
+def test_the_same_training_again_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
+    asked = []
+    for name in ("first", "second"):
+        command = [*tiny_run.arguments, "--out", str(tmp_path / name)]
+        asked.append(counts(fork, command, tiny_settings, tmp_path))
+    (first, _), (second, there) = asked
+    assert first == second == there > 100
 
 
 def test_acting_compiles_once_for_all_mazes(tiny_run, islands):
@@ -75,7 +90,7 @@ def kept(monkeypatch, tmp_path):
     def keep():
         chosen = {FOLDER: None}
         with monkeypatch.context() as patch:
-            patch.setattr(compilation.jax, "config", type("Config", (), {"values": chosen, "update": chosen.__setitem__}))
+            patch.setattr(compilation.jax, "config", SimpleNamespace(values=chosen, update=chosen.__setitem__))
             compilation.keep_programs()
         return chosen[FOLDER]
 

@@ -98,7 +98,6 @@ def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, 
     killer = Killer(fork, tiny_run.arguments, tiny_settings, kills=3, operations=200, seed=1)
     killer.run(tmp_path / "run")
     assert len(killer.where) == 3, killer.where
-    print(killer.where)
     assert_same_end(tmp_path / "run", tiny_run.folder)
 
 
