@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ct_envs import ANT, POINT, MazeEnv, UserError, make_maze
+from ct_envs import ANT, HUMANOID, POINT, MazeEnv, UserError, make_maze
 from ct_envs.frames import own_frame, symmetries, turn
 from ct_envs.physics import PhysicsState
 from ct_envs.robots import Robot
@@ -33,7 +33,7 @@ def first_proprio(robot: Robot) -> jax.Array:
     return state.obs["proprio"]
 
 
-@pytest.mark.parametrize(("robot", "size"), [(POINT, 8), (ANT, 32)], ids=["point", "ant"])
+@pytest.mark.parametrize(("robot", "size"), [(POINT, 8), (ANT, 32), (HUMANOID, 8)], ids=["point", "ant", "humanoid"])
 def test_a_symmetric_world_behaves_symmetrically(robot, size):
     group = symmetries(robot)
     assert len(group.world) == len(group.proprio) == len(group.action) == size
@@ -51,7 +51,7 @@ def test_a_symmetric_world_behaves_symmetrically(robot, size):
     assert np.abs(after[-1, 0, 2:] - np.asarray(proprio)).max() > 0.1  # something happened
 
 
-@pytest.mark.parametrize("robot", [POINT, ANT], ids=["point", "ant"])
+@pytest.mark.parametrize("robot", [POINT, ANT, HUMANOID], ids=["point", "ant", "humanoid"])
 def test_symmetries_are_a_group(robot):
     group = symmetries(robot)
     rows = np.concatenate([group.world.reshape(len(group.world), -1), group.action.reshape(len(group.action), -1)], 1)

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from ct_envs.errors import UserError
     from ct_envs.maze import Maze, load_maze, make_maze, maze_names, random_walls, stack_mazes
     from ct_envs.maze_env import MazeEnv, Tasks
-    from ct_envs.robots import ANT, POINT, ROBOTS, Robot
+    from ct_envs.robots import ANT, HUMANOID, POINT, ROBOTS, Robot
 
 __all__ = [
-    "ANT", "POINT", "ROBOTS", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
+    "ANT", "HUMANOID", "POINT", "ROBOTS", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
     "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes",
 ]  # fmt: skip
 
@@ -21,7 +21,7 @@ _NAMES = {
     "errors": ("UserError",),
     "maze": ("Maze", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes"),
     "maze_env": ("MazeEnv", "Tasks"),
-    "robots": ("ANT", "POINT", "ROBOTS", "Robot"),
+    "robots": ("ANT", "HUMANOID", "POINT", "ROBOTS", "Robot"),
 }
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 

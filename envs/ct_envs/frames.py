@@ -72,11 +72,27 @@ def _ant_element(
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     order = list(itertools.chain.from_iterable((2 * leg, 2 * leg + 1) for leg in source))
     signs = list(itertools.chain.from_iterable((hip, sign) for sign in ankle))
-    joints = _signed(order, signs)
-    # Velocity is a vector of the world, angular velocity an axial vector of the body.
-    velocity = _blocks(world, np.eye(1))
     angular = _blocks(parity * world if spin is None else spin, parity * np.eye(1))
-    return world, _blocks(np.eye(1), quat, joints, velocity, angular, joints), joints
+    return _element(world, quat, angular, _signed(order, signs))
+
+
+def _element(
+    world: np.ndarray, quat: np.ndarray, angular: np.ndarray, joints: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Of a free torso: velocity is a vector of the world, angular velocity an axial vector of the body."""
+    return world, _blocks(np.eye(1), quat, joints, _blocks(world, np.eye(1)), angular, joints), joints
+
+
+def _humanoid() -> list[tuple[np.ndarray, ...]]:
+    """Left and right change places, and the world may turn by quarters with the robot in it."""
+    # new joint i is old joint order[i] with this sign: abdomen z, y, x; right leg x, z, y, knee; left leg; right arm
+    # (two of the shoulder, elbow); left arm. See assets/humanoid.xml for the axes.
+    order = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6, 14, 15, 16, 11, 12, 13]
+    joints = _signed(order, [-1, 1, -1] + [1] * 8 + [-1, -1, 1] * 2)
+    flip_y = _element(-_FLIP_X, np.diag([1.0, -1.0, 1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), joints)
+    half = np.sqrt(0.5)  # left-multiplication by a quarter turn about z
+    turn = half * np.array([[1.0, 0, 0, -1], [0, 1, -1, 0], [0, 1, 1, 0], [1, 0, 0, 1]])
+    return [flip_y, _element(_FLIP_X @ _SWAP, turn, np.eye(3), np.eye(17))]
 
 
 def _signed(order: list[int], signs: list[int]) -> np.ndarray:
@@ -98,7 +114,7 @@ def _turtlebot3() -> list[tuple[np.ndarray, ...]]:
     return [(flip_y, flip_y, flip_y)]
 
 
-_GENERATORS = {"point": _point, "ant": _ant, "turtlebot3": _turtlebot3}
+_GENERATORS = {"point": _point, "ant": _ant, "humanoid": _humanoid, "turtlebot3": _turtlebot3}
 
 
 def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:

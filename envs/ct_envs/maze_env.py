@@ -35,7 +35,7 @@ class MazeEnv(Env):
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
     velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
-    Action: [-1, 1]^nu. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or
+    Action: [-1, 1]^nu, shares of the actuators' range. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or
     action that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``,
     ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``,
     ``tasks`` and ``key``.
@@ -76,6 +76,7 @@ class MazeEnv(Env):
         self.engine = make_engine(engine, self.robot, cell_m=cell_m)
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
         self.horizon = horizon or self.robot.horizon
+        self._ctrl_max = self.engine.model.actuator_ctrlrange[:, 1].astype(np.float32)
         self._reset_velocity = self.robot.reset_velocity_mps if reset_velocity_mps is None else reset_velocity_mps
 
     @property
@@ -151,11 +152,14 @@ class MazeEnv(Env):
         return PhysicsState(qpos, qvel, jnp.zeros(model.nv))
 
     def _fell(self, physics: PhysicsState) -> jax.Array:
-        """Whether the torso is tilted too far."""
-        if self.robot.upright_min is None:
-            return jnp.zeros((), bool)
-        _, x, y, _ = physics.qpos[3:7]
-        return 1.0 - 2.0 * (x**2 + y**2) < self.robot.upright_min
+        """Whether the torso is tilted too far or too low."""
+        fell = jnp.zeros((), bool)
+        if self.robot.upright_min is not None:
+            _, x, y, _ = physics.qpos[3:7]
+            fell |= 1.0 - 2.0 * (x**2 + y**2) < self.robot.upright_min
+        if self.robot.height_min_m is not None:
+            fell |= physics.qpos[2] < self.robot.height_min_m
+        return fell
 
     def _observe(self, physics: PhysicsState, state: State) -> State:
         position, goal = physics.qpos[:2], state.info["goal"]
@@ -170,7 +174,7 @@ class MazeEnv(Env):
         before = state.pipeline_state
         walls = nearest_walls(state.info["maze"], before.qpos[:2])
         ctrl = jnp.clip(action, -1.0, 1.0)
-        physics, touching = self.engine.step(before, ctrl, walls)
+        physics, touching = self.engine.step(before, self._ctrl_max * ctrl, walls)
         # The action too: MuJoCo would read one that is not a number as zero, and carry on.
         finite = jnp.all(jnp.isfinite(jnp.concatenate([physics.qpos, physics.qvel, ctrl])))
         physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)

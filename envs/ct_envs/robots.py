@@ -21,6 +21,7 @@ class Robot:
     reset_velocity_mps: float = 0.0  # standard deviation of the speed after a reset
     reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
     upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
+    height_min_m: float | None = None  # height of the torso below which the robot has fallen
     controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-F)
     has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
     course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
@@ -51,6 +52,20 @@ ANT = Robot(
     controller_reward="distance",
 )
 
+HUMANOID = Robot(
+    name="humanoid",
+    xml="humanoid.xml",
+    radius_m=1.0,  # a stretched arm reaches 0.8 m
+    touch_m=1.3,
+    top_speed_mps=7.0,
+    control_dt_s=0.03,
+    horizon=2000,
+    reset_velocity_mps=0.05,
+    reset_joints_rad=0.05,
+    height_min_m=1.0,  # it stands at 1.28 m; of Humanoid-v5
+    has_heading=True,
+)
+
 TURTLEBOT3 = Robot(
     name="turtlebot3",
     xml="turtlebot3_burger.urdf",
@@ -63,7 +78,7 @@ TURTLEBOT3 = Robot(
     course="room",
 )
 
-ROBOTS = {robot.name: robot for robot in (POINT, ANT, TURTLEBOT3)}
+ROBOTS = {robot.name: robot for robot in (POINT, ANT, HUMANOID, TURTLEBOT3)}
 
 
 def get_robot(name: str, course: str | None = None) -> Robot:
