@@ -44,11 +44,11 @@ class MazeCourse:
         roadmap = _roadmap(run)
         with run.stage("controller") as (folder, info):
             with training(folder, "controller", config.iterations, metrics) as watch:
-                controller, held_out = train_controller(
+                controller, tested = train_controller(
                     run.key("controller"), run.env, roadmap.maze, roadmap, config, **watch
                 )
-            save_controller(folder, run.robot, config, controller, run.made | {"held_out_success": held_out})
-            info |= {"held_out_success": held_out}
+            save_controller(folder, run.robot, config, controller, run.made | tested)
+            info |= tested
         return controller, config
 
     def collect(self, key: jax.Array, controller: SacController, folder: Path, on_progress: Progress) -> Trajectories:

@@ -182,8 +182,8 @@ def test_it_goes_on_as_if_nothing_had_happened(roadmap, tmp_path):
     """Interrupted by Ctrl-C and continued: the same controller, to the bit."""
     train = functools.partial(train_controller, jax.random.key(0), ENV, UMAZE, roadmap, TINY, chunk=4)
     seen = []
-    whole, success = train(on_progress=lambda i, metrics: seen.append((i, metrics["critic_loss"])))
-    assert [i for i, _ in seen] == [4, 8] and 0 <= success <= 1
+    whole, tested = train(on_progress=lambda i, metrics: seen.append((i, metrics["critic_loss"])))
+    assert [i for i, _ in seen] == [4, 8] and all(0 <= share <= 1 for share in tested.values())
 
     def interrupt(iteration, metrics):
         raise KeyboardInterrupt
@@ -193,10 +193,10 @@ def test_it_goes_on_as_if_nothing_had_happened(roadmap, tmp_path):
         train(on_progress=interrupt, checkpoints=first)
     first.close()
     second, rest = Checkpoints(tmp_path / "states"), []
-    again, again_success = train(on_progress=lambda i, _: rest.append(i), checkpoints=second)
+    again, again_tested = train(on_progress=lambda i, _: rest.append(i), checkpoints=second)
     second.close()
     assert rest == [8]
-    assert same(again, whole) and again_success == success
+    assert same(again, whole) and again_tested == tested
 
 
 # ---------------------------------------------------------------------------------------------------- the result
@@ -235,8 +235,8 @@ def test_without_compilation(roadmap):
 def test_it_learns_to_walk(roadmap):
     """The umaze in half a minute or so."""
     config = SacConfig(iterations=400, warmup=10, hidden=(64, 64), episode_steps=40)
-    _, success = train_controller(jax.random.key(0), ENV, UMAZE, roadmap, config)
-    assert success > 0.9
+    _, tested = train_controller(jax.random.key(0), ENV, UMAZE, roadmap, config)
+    assert tested["held_out_success"] > 0.9 and tested["twenty_in_a_row"] > 0.8
 
 
 # ------------------------------------------------------------------------------------------------------- the ant

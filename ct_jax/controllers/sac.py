@@ -51,6 +51,9 @@ class SacConfig:
     fall_m: tuple[float, float] = (5.0, 20.0)  # a fall costs what lying for ever this much farther off would [m]: at
     # first, while each attempt to walk ends in one, and later; with 60 m the ant rather stood still
     fall_ramp: tuple[float, float] = (0.2, 0.5)  # from where to where in the training it grows
+    alive_bonus: float = 0.0  # reward of each step on its feet (paper, for the humanoid), the only price of a fall then
+    speed_mps: float | None = None  # of a velocity reward: being faster than this towards the goal earns no more
+    action_cost: float = 0.0  # price of a step with all actuators at their limits
     tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
     effort: float = 1.0  # share of the actuators' range that the controller uses
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
@@ -65,6 +68,7 @@ class SacConfig:
     )
     relabel_m: float = 10.0  # how far off those goals are, at most [m]
     chain: bool = False  # after a success go on from there along a next edge, as a plan does
+    through: bool = False  # with ``chain``: an arrival ends nothing, what comes on the next edge counts as well
     reward_scale: float = 1.0  # of the reward in the losses
 
 
@@ -184,6 +188,8 @@ class Sac:
             raise UserError(f"no frame named '{config.frame}'; frames: {', '.join(FRAMES)}")
         if config.frame == "heading" and not env.robot.has_heading:
             raise UserError(f"robot '{env.robot.name}' has no heading; use frame='world'")
+        if config.through and not config.chain:
+            raise UserError("a controller learns through arrivals only along chained edges: set chain=True")
         self.env, self.config = env, config
         self._symmetries = symmetries(env.robot) if config.mirror else None
         self._input_size = input_size(env.proprio_size, config.frame)
@@ -281,7 +287,7 @@ class Sac:
         random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
         after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
-        reward = self._reward(state.env, after)
+        reward = self._reward(state.env, action, after)
         over = after.done
         truncation = after.info["truncation"]
         transition = Transition(
@@ -303,10 +309,10 @@ class Sac:
             "reward": reward.mean(), "episodes": over.sum(), "successes": count("success"), "falls": count("fall"),
         }  # fmt: skip
 
-    def _reward(self, before: State, after: State) -> jax.Array:
-        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; a bonus.
+    def _reward(self, before: State, action: jax.Array, after: State) -> jax.Array:
+        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; bonuses.
 
-        Of a fall it is minus the distance, whatever the robot's reward: see ``_pay_falls``.
+        Of a fall without an alive bonus it is minus the distance, whatever the robot's reward: see ``_pay_falls``.
         """
         config = self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
@@ -314,12 +320,19 @@ class Sac:
         if config.tilt_m:
             up = own_frame(after.obs["proprio"])[1][..., 3]  # pyright: ignore
             dense -= config.tilt_m * (1.0 - up)
+        if config.action_cost:
+            dense -= config.action_cost * jnp.mean(action**2, -1)
         dense += config.arrival_bonus * after.done * after.info["success"]
-        return jnp.where(after.done * after.info["fall"] > 0, after.reward, dense)
+        fall = after.done * after.info["fall"]
+        if config.alive_bonus:
+            return dense + config.alive_bonus * (1.0 - fall)
+        return jnp.where(fall > 0, after.reward, dense)
 
     def _towards(self, before_m: jax.Array, after_m: jax.Array) -> jax.Array:
         """The reward of a step that begins and ends at these distances from the goal [m]."""
-        return (before_m - after_m) / self.env.robot.control_dt_s if self.reward == "velocity" else -after_m
+        if self.reward == "distance":
+            return -after_m
+        return jnp.minimum((before_m - after_m) / self.env.robot.control_dt_s, self.config.speed_mps or jnp.inf)
 
     def _relabel(self, batch: Transition, key: jax.Array) -> Transition:
         """The batch with other goals for some of the steps, and what they would have earned on the way there.
@@ -330,15 +343,16 @@ class Sac:
         which_key, angle_key, far_key = jax.random.split(key, 3)
         shape = batch.reward.shape
         chosen = jax.random.bernoulli(which_key, config.relabel, shape) & (batch.discount > 0)
-        angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
-        distance = jax.random.uniform(far_key, shape, minval=tolerance, maxval=config.relabel_m)
-        goal = distance[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+        goal = self._draw_goals(angle_key, far_key, shape)
         old, old_after = batch.observation[:, -2:], batch.next_observation[:, -2:]
         after = goal - (old - old_after)
         length = lambda vectors: jnp.linalg.norm(vectors, axis=-1)  # noqa: E731
         arrived = length(after) < tolerance
         reward = batch.reward - self._towards(length(old), length(old_after)) + config.arrival_bonus * arrived
         reward += self._towards(length(goal), length(after))
+        if config.through:
+            next_keys = jax.random.split(jax.random.fold_in(key, 1))
+            after = jnp.where(arrived[:, None], self._draw_goals(*next_keys, shape), after)
 
         def put(seen: jax.Array, goals: jax.Array) -> jax.Array:
             return jnp.where(chosen[:, None], jnp.concatenate([seen[:, :-2], goals], -1), seen)
@@ -350,11 +364,20 @@ class Sac:
             discount=jnp.where(chosen, 1.0 - arrived, batch.discount),
         )
 
+    def _draw_goals(self, angle_key: jax.Array, far_key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        """Goals all around the robot, out of reach yet [m]."""
+        angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
+        nearest, farthest = self.env.robot.goal_tolerance_m, self.config.relabel_m
+        distance = jax.random.uniform(far_key, shape, minval=nearest, maxval=farthest)
+        return distance[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+
     def _pay_falls(self, batch: Transition, iteration: jax.Array) -> Transition:
         """The batch with falls paid like lying for ever, ``fall_m`` farther off, as they cost by now.
 
-        Without it a fall would end the losses of a robot far away.
+        Without it a fall would end the losses of a robot far away. With an alive bonus it ends the gains.
         """
+        if self.config.alive_bonus:
+            return batch
         config, fall = self.config, batch.extras["state_extras"]["fall"]
         share = iteration / config.iterations
         farther = jnp.interp(share, jnp.asarray(config.fall_ramp), jnp.asarray(config.fall_m))
@@ -370,6 +393,8 @@ class Sac:
         mirror_key, goal_key = jax.random.split(key)
         if self.config.relabel:
             batch = self._relabel(batch, goal_key)
+        if self.config.through:
+            batch = batch._replace(discount=1.0 - batch.extras["state_extras"]["fall"])
         now, action, after = batch.observation, batch.action, batch.next_observation
         if self._symmetries is not None:
             pick = jax.random.randint(mirror_key, (len(action),), 0, len(self._symmetries.world))
@@ -431,6 +456,24 @@ def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: j
     return float(state.info["success"].mean())
 
 
+def edges_in_a_row(
+    env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array, *, edges: int = 20, walkers: int = 100
+) -> float:
+    """Share of the walkers that, from rest, walk so many edges on end, each in time and without a fall.
+
+    ``env`` must reset by itself, and the tasks follow each other (``chain_tasks``).
+    """
+    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, None)))(jax.random.split(key, walkers), maze, tasks)
+    walked, unbroken = np.zeros(walkers, int), np.ones(walkers, bool)
+    for i in range(edges):  # as many steps as the slowest may take
+        state, _, steps = rollout(env, Steered(act), state, (), jax.random.fold_in(key, i), env.horizon)
+        ended = 1.0 - np.concatenate([np.asarray(steps.alive)[1:], 1.0 - np.asarray(state.done)[None]])
+        won = np.asarray(steps.success) > 0
+        whole = unbroken & (np.cumsum((ended > 0) & ~won, 0) == 0)
+        walked, unbroken = walked + (whole & won).sum(0), whole[-1]
+    return float((walked >= edges).mean())
+
+
 def train_controller(
     key: jax.Array,
     env_factory: Callable[..., MazeEnv],
@@ -441,7 +484,7 @@ def train_controller(
     on_progress: Callable[[int, dict[str, float]], None] = lambda iteration, metrics: None,
     checkpoints: Checkpoints | None = None,
     chunk: int = 25,
-) -> tuple[SacController, float]:
+) -> tuple[SacController, dict[str, float]]:
     """Algorithm 2: learn pi_c on the roadmap's edges.
 
     Args:
@@ -450,7 +493,7 @@ def train_controller(
         checkpoints: where to go on from, and where to save now and then and when interrupted.
 
     Returns:
-        The controller, and its success on held-out edges.
+        The controller; its success on held-out edges and on twenty of any edges in a row.
     """
     train_key, test_key, split_key = jax.random.split(key, 3)
     seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
@@ -466,5 +509,9 @@ def train_controller(
         checkpoints, chunk,
     )  # fmt: skip
     act = SacController(state.normalizer, state.average, env.action_size, config.hidden, config.frame, config.effort)
-    test_env = env_factory(maps=False, horizon=config.episode_steps, auto_reset=False)
-    return act, edge_success(test_env, act, maze, test_tasks, test_key)
+    alone, in_a_row = (env_factory(maps=False, horizon=config.episode_steps, auto_reset=again) for again in (False, True))
+    every_edge = chain_tasks(_tasks(roadmap, roadmap.edges), seed)
+    return act, {
+        "held_out_success": edge_success(alone, act, maze, test_tasks, test_key),
+        "twenty_in_a_row": edges_in_a_row(in_a_row, act, maze, every_edge, jax.random.fold_in(test_key, 0)),
+    }
