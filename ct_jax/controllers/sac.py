@@ -58,6 +58,8 @@ class SacConfig:
     effort: float = 1.0  # share of the actuators' range that the controller uses
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
     replay: int = 200_000  # transitions kept
+    turn_ramp: tuple[float, float] | None = None  # from where to where in the training robots begin to look anywhere;
+    # before, at the goal; without it, always anywhere
     episode_steps: int = 60  # control steps to walk an edge
     reset_velocity_mps: float = 2.0  # spread of the speed at an edge's start: a plan arrives there moving
     held_out: float = 0.1  # share of the edges kept for the final test
@@ -243,6 +245,8 @@ class Sac:
         critic = self.networks.q_network.init(critic_key)
         log_alpha = jnp.log(jnp.asarray(self.config.initial_temperature))
         resets = jax.vmap(self.env.reset, in_axes=(0, None, None))
+        if self.config.turn_ramp is not None and tasks is not None:
+            tasks = tasks.replace(turn_rad=jnp.zeros(()))
         return SacState(
             policy=policy,
             average=policy,
@@ -263,7 +267,7 @@ class Sac:
         """Run some iterations (static); returns means over them."""
 
         def iterate(state: SacState, _) -> tuple[SacState, dict[str, jax.Array]]:
-            state, collected = self._collect(state)
+            state, collected = self._collect(self._ease(state))
             state, losses = jax.lax.cond(
                 state.iteration >= self.config.warmup,
                 self._updates,
@@ -277,6 +281,16 @@ class Sac:
         means = jax.tree.map(jnp.mean, metrics)
         rates = {"success": metrics["successes"].sum() / ends, "fall": metrics["falls"].sum() / ends}
         return state, means | rates
+
+    def _ease(self, state: SacState) -> SacState:
+        """The state with its environments' starts as hard as they are by now."""
+        if self.config.turn_ramp is None:
+            return state
+        share = jnp.interp(
+            state.iteration / self.config.iterations, jnp.asarray(self.config.turn_ramp), jnp.arange(2.0)
+        )
+        tasks = state.env.info["tasks"].replace(turn_rad=jnp.full(self.config.envs, jnp.pi * share))
+        return state.replace(env=state.env.replace(info=state.env.info | {"tasks": tasks}))
 
     def _collect(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
         key, act_key, random_key = jax.random.split(state.key, 3)
@@ -509,7 +523,9 @@ def train_controller(
         checkpoints, chunk,
     )  # fmt: skip
     act = SacController(state.normalizer, state.average, env.action_size, config.hidden, config.frame, config.effort)
-    alone, in_a_row = (env_factory(maps=False, horizon=config.episode_steps, auto_reset=again) for again in (False, True))
+    alone, in_a_row = (
+        env_factory(maps=False, horizon=config.episode_steps, auto_reset=again) for again in (False, True)
+    )
     every_edge = chain_tasks(_tasks(roadmap, roadmap.edges), seed)
     return act, {
         "held_out_success": edge_success(alone, act, maze, test_tasks, test_key),

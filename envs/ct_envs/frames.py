@@ -76,9 +76,7 @@ def _ant_element(
     return _element(world, quat, angular, _signed(order, signs))
 
 
-def _element(
-    world: np.ndarray, quat: np.ndarray, angular: np.ndarray, joints: np.ndarray
-) -> tuple[np.ndarray, ...]:
+def _element(world: np.ndarray, quat: np.ndarray, angular: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, ...]:
     """Of a free torso: velocity is a vector of the world, angular velocity an axial vector of the body."""
     return world, _blocks(np.eye(1), quat, joints, _blocks(world, np.eye(1)), angular, joints), joints
 

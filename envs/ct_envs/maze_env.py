@@ -28,6 +28,7 @@ class Tasks:
     goal: Float[Array, "*b M 2"]  # [m]
     n: Int[Array, "*b"]  # how many of the M are meant
     follow: Int[Array, "*b M D"] | None = None  # tasks one of which follows a success, from where the robot is then
+    turn_rad: Float[Array, "*b"] | None = None  # a robot with a heading begins within this of facing its goal
 
 
 class MazeEnv(Env):
@@ -35,10 +36,10 @@ class MazeEnv(Env):
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
     velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
-    Action: [-1, 1]^nu, shares of the actuators' range. An episode ends with success (within the goal tolerance), with a failure (a fall, or a state or
-    action that is not finite) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``,
-    ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``, ``goal``, ``maze``,
-    ``tasks`` and ``key``.
+    Action: [-1, 1]^nu, shares of the actuators' range. An episode ends with success (within the goal tolerance), with a
+    failure (a fall, or a state or action that is not finite) or, as truncation, at the horizon. ``state.info`` holds
+    ``success``, ``fall``, ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``,
+    ``position``, ``goal``, ``maze``, ``tasks`` and ``key``.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class MazeEnv(Env):
     def _begin(self, key: jax.Array, state: State) -> State:
         """The first state of an episode, in the maze and with the tasks of ``state``."""
         task, start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
-        physics = self._initial_physics(jax.random.fold_in(key, 1), start)
+        physics = self._initial_physics(jax.random.fold_in(key, 1), start, goal, state.info["tasks"])
         info = state.info | {"task": task, "goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
         return self._observe(physics, state.replace(info=info))
 
@@ -136,13 +137,17 @@ class MazeEnv(Env):
         goal = jnp.where(won, tasks.goal[task], fresh.info["goal"])
         return physics, fresh.replace(info=fresh.info | {"task": task, "goal": goal})
 
-    def _initial_physics(self, key: jax.Array, start: jax.Array) -> PhysicsState:
-        """Standing at ``start`` [m]; a robot that has a heading looks anywhere."""
+    def _initial_physics(self, key: jax.Array, start: jax.Array, goal: jax.Array, tasks: Tasks | None) -> PhysicsState:
+        """Standing at ``start`` [m]; a robot that has a heading looks anywhere, or not too far from its goal."""
         model, robot = self.engine.model, self.robot
         speed_key, yaw_key, joint_key = jax.random.split(key, 3)
         qpos = jnp.asarray(model.key_qpos[0] if model.nkey else model.qpos0, jnp.float32).at[:2].set(start)
         if robot.has_heading:
-            half = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi) / 2.0
+            yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+            if tasks is not None and tasks.turn_rad is not None:
+                x, y = goal - start
+                yaw = jnp.arctan2(y, x) + tasks.turn_rad / jnp.pi * yaw
+            half = yaw / 2.0
             qpos = qpos.at[3:7].set(jnp.array([jnp.cos(half), 0.0, 0.0, jnp.sin(half)]))
             noise = jax.random.uniform(joint_key, qpos[7:].shape, minval=-1.0, maxval=1.0)
             qpos = qpos.at[7:].add(robot.reset_joints_rad * noise)
