@@ -53,7 +53,7 @@ class Train:
     """
 
     robot: Annotated[Positional[str], arg(metavar="ROBOT")]
-    """Robot to train: point, ant or turtlebot3 (in PyBullet, in cluttered rooms instead of mazes)."""
+    """Robot to train: point, ant, humanoid or turtlebot3 (in PyBullet, in cluttered rooms instead of mazes)."""
     preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
     """How much of everything: demo (minutes), cpu (an hour on two cores), published (the bare method at that size) or
     paper (the published sizes; wants a GPU)."""

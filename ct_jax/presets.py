@@ -108,17 +108,64 @@ _ANT_SAC = SacConfig(
 )
 
 
+_HUMANOID_SAC = SacConfig(
+    envs=128,
+    iterations=150_000,
+    updates=4,
+    warmup=30,
+    final_rate=0.1,
+    average=0.9995,
+    critic_norm=True,
+    hidden=(512, 512),  # paper
+    discount=0.99,
+    alive_bonus=1.0,
+    speed_mps=2.0,
+    action_cost=0.2,
+    target_rate=0.01,
+    reward_scale=0.1,
+    replay=500_000,
+    episode_steps=400,
+    reset_velocity_mps=0.05,
+    frame="heading",
+    mirror=True,
+    relabel=0.25,
+    chain=True,
+    through=True,
+    turn_ramp=(0.03, 0.15),
+)
+
+
 def _for_ant(settings: Settings) -> Settings:
-    """A controller that has to balance, slower walks, and for what lifts the method a head that knows the heading and a
-    longer memory: the ant is half as fast as the point."""
-    collect = replace(settings.collect, horizon=700, noise=0.2 * settings.collect.noise)
-    settings = replace(settings, sac=_ANT_SAC, collect=collect)
+    """The ant is half as fast as the point: longer ways, rounds and memory."""
+    settings = _for_walker(settings, _ANT_SAC, horizon=700, calm=0.2)
+    return replace(settings, rounds=min(settings.rounds, 6))
+
+
+def _for_humanoid(settings: Settings) -> Settings:
+    """Three of its control steps are one of the ant's, and it is as easily brought down."""
+    settings = _for_walker(settings, _HUMANOID_SAC, horizon=1600, calm=0.1)
+    recover = settings.recover
+    recover = replace(
+        recover,
+        stuck_steps=3 * recover.stuck_steps,
+        patience=3 * recover.patience,
+        takeover=recover.takeover / 3,
+    )
+    model = replace(settings.model, max_timestep=2048)
+    return replace(settings, recover=recover, model=model, rounds=min(settings.rounds, 6))
+
+
+def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float) -> Settings:
+    """A controller that has to balance, disturbances that leave it standing, and for what lifts the method a head that
+    knows the heading and a longer memory."""
+    collect = replace(settings.collect, horizon=horizon, noise=calm * settings.collect.noise)
+    settings = replace(settings, sac=sac, collect=collect)
     if not settings.reprompt:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)
     fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
     longer = {name: replace(fit, steps=96) for name, fit in fits.items() if fit is not None}
-    return replace(settings, model=model, rounds=min(settings.rounds, 6), **longer)
+    return replace(settings, model=model, **longer)
 
 
 TURTLEBOT3_PAPER = Settings(
@@ -167,6 +214,7 @@ TURTLEBOT3_PRESETS = {
 _OF_ROBOT: dict[str, Callable[[], dict[str, Settings]]] = {
     "point": lambda: PRESETS,
     "ant": lambda: {name: _for_ant(settings) for name, settings in PRESETS.items()},
+    "humanoid": lambda: {name: _for_humanoid(settings) for name, settings in PRESETS.items()},
     "turtlebot3": lambda: TURTLEBOT3_PRESETS,
 }
 

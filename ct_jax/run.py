@@ -195,7 +195,9 @@ def maze_text(maze: Maze) -> str:
 def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The paper's training and evaluation mazes for a robot, if it is one for mazes. Raises UserError for an unknown
     one."""
-    return (("antmaze-large",), ("antmaze-large-eval",)) if get_robot(robot).course == "maze" else ((), ())
+    if get_robot(robot).course != "maze":
+        return (), ()
+    return ("antmaze-large",), ("antmaze-large-eval", "hall") if robot == "humanoid" else ("antmaze-large-eval",)
 
 
 def slug(name: str) -> str:

@@ -17,11 +17,10 @@ from ct_jax import pipeline
 from ct_jax import trajectories as storage
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
 from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
-from ct_jax.baselines.sac_alone import train_sac_alone
+from ct_jax.baselines.sac_alone import EDGES_ONLY, train_sac_alone
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
-from ct_jax.finetune import RecoverConfig
 from ct_jax.mazes import evaluated
 from ct_jax.presets import Settings, get_preset
 from ct_jax.progress import Metrics
@@ -118,7 +117,7 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         "bc": replace(published, model=replace(published.model, returns=False)),
         "f-ct": replace(
             published,
-            recover=RecoverConfig(recoveries=500, bumps=20),
+            recover=replace(published.recover, recoveries=500, bumps=published.recover.stuck_steps // 2),
             rounds=1,
             round_fit=replace(published.fit, updates=published.fit.updates // 2, warmup=20),
         ),
@@ -126,10 +125,8 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
     }
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)
-    # Alone, the maze is the task: longer ways, so a longer view.
-    sac = replace(
-        lifted.sac, discount=0.99, chain=False, mirror=False, relabel=0.0, iterations=lifted.sac.iterations // 2
-    )
+    # Alone, the maze is the task: longer ways, so a longer view, and no edges to arrange.
+    sac = replace(lifted.sac, discount=0.99, iterations=lifted.sac.iterations // 2, alive_bonus=0.0, **EDGES_ONLY)
     return Plan(variants, Baselines(cql, sac))
 
 

@@ -14,14 +14,15 @@ from _variants import Baselines, Plan, plan_for, run_plan, share
 from table import differences, interval_of_mean, room_table, transfer_table
 from turtlebot3 import variants_for
 
-from ct_envs import UserError
+from ct_envs import MazeEnv, UserError
 from ct_jax.baselines.cql import CqlConfig
+from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.run import Run, load_mazes
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 
-@pytest.mark.parametrize("robot", ["point", "ant"])
+@pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
     assert list(plan.variants) == ["published", "bc", "f-ct", "cpu"] and plan.baselines is not None
@@ -29,6 +30,8 @@ def test_the_methods_of_the_table(robot):
     assert replace(bc, model=published.model) == published and not bc.model.returns
     assert fct.rounds == 1 and fct.recover.keep == "separate" and fct.collect == published.collect
     assert not published.reprompt and published.collect.guide == "roadmap" and published.model.frame == "world"
+    assert (fct.recover.stuck_steps, fct.recover.bumps) == ((120, 60) if robot == "humanoid" else (40, 20))
+    SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines.sac, replay=2000))  # its settings are for it
 
 
 def test_variants_can_be_chosen_and_unknown_ones_are_refused():

@@ -155,8 +155,7 @@ def test_engines_agree():
     qpos = np.tile(engines[0].model.key("stand").qpos, (2, 1)).astype(np.float32)
     qpos[:, :2] = [[6.0, 6.0], [6.0, 4.36]]  # the second has an elbow at the wall
     state = PhysicsState(jnp.asarray(qpos), jnp.zeros((2, 23)), jnp.zeros((2, 23)))
-    quickly = {"xla_backend_optimization_level": 0}  # compiled: its walls and limbs make a long program
-    steps = [jax.jit(jax.vmap(engine.step), compiler_options=quickly) for engine in engines]
+    steps = [jax.jit(jax.vmap(engine.step)) for engine in engines]
     ctrls = jax.random.uniform(jax.random.key(0), (8, 2, 17), minval=-0.2, maxval=0.2)
     touched = []
     for ctrl in ctrls:

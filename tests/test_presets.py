@@ -13,7 +13,7 @@ from ct_jax.presets import PRESETS, Settings, from_dict, get_preset, to_dict
 
 ALL = (
     PRESETS
-    | {f"{name} for the ant": get_preset(name, "ant") for name in PRESETS}
+    | {f"{name} for the {robot}": get_preset(name, robot) for name in PRESETS for robot in ("ant", "humanoid")}
     | {
         "default": Settings(),
         "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),

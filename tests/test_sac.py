@@ -20,6 +20,7 @@ from ct_jax.controllers.sac import (
     chain_tasks,
     controller_networks,
     edge_success,
+    edges_in_a_row,
     input_size,
     split_edges,
     train_controller,
@@ -168,14 +169,40 @@ def test_rewards(kind, roadmap):
     step, reward = jax.jit(jax.vmap(sac.env.step)), jax.jit(sac._reward)
     arrived = False
     for _ in range(4):
-        after = step(state, jnp.tile(jnp.array([[1.0, 0.0]]), (TINY.envs, 1)))
+        action = jnp.tile(jnp.array([[1.0, 0.0]]), (TINY.envs, 1))
+        after = step(state, action)
         left = -np.asarray(after.reward)
         dense = (before - left) / 0.1 if kind == "velocity" else -left
         won = (np.asarray(after.info["success"]) * np.asarray(after.done)) > 0
-        np.testing.assert_allclose(reward(state, after), dense + TINY.arrival_bonus * won, atol=1e-3)
+        np.testing.assert_allclose(reward(state, action, after), dense + TINY.arrival_bonus * won, atol=1e-3)
         arrived |= won.any() and not won.all()
         state, before = after, np.linalg.norm(after.obs["goal"], axis=-1)
     assert arrived
+
+
+def test_an_alive_bonus_is_all_that_a_fall_costs():
+    """And being faster than asked for earns no more, while effort has its price."""
+    config = replace(TINY, alive_bonus=2.0, speed_mps=1.0, action_cost=0.5, arrival_bonus=0.0)
+    sac = make(config)
+    state = sac.create(
+        jax.random.key(1), UMAZE, Tasks(jnp.array([[6.0, 6.0]]), jnp.array([[6.0, 14.0]]), jnp.asarray(1))
+    )
+    left = np.linalg.norm(state.env.obs["goal"], axis=-1) - np.array([0.05, 0.2, -0.2, 0.05])  # in 0.1 s
+    fall = jnp.array([0.0, 0.0, 0.0, 1.0])
+    after = state.env.replace(reward=jnp.asarray(-left), done=fall, info=state.env.info | {"fall": fall})
+    reward = sac._reward(state.env, jnp.full((4, 2), 0.5), after)
+    np.testing.assert_allclose(reward, np.array([0.5, 1.0, -2.0, 0.5]) - 0.125 + [2, 2, 2, 0], atol=1e-4)
+    batch = Transition(jnp.zeros((4, 4)), jnp.zeros((4, 2)), reward, 1.0 - fall, jnp.zeros((4, 4)),
+                       {"state_extras": {"truncation": 0 * fall, "fall": fall}})  # fmt: skip
+    assert same(sac._pay_falls(batch, jnp.array(0)), batch)
+
+
+def test_starts_turn_away_from_their_goals_bit_by_bit(roadmap):
+    sac = make(replace(TINY, iterations=10, turn_ramp=(0.2, 0.6)), ANT)
+    state = sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+    for iteration, share in ((0, 0.0), (2, 0.0), (4, 0.5), (8, 1.0)):
+        eased = sac._ease(state.replace(iteration=jnp.asarray(iteration)))
+        np.testing.assert_allclose(eased.env.info["tasks"].turn_rad, np.full(TINY.envs, np.pi * share), rtol=1e-6)
 
 
 def test_it_goes_on_as_if_nothing_had_happened(roadmap, tmp_path):
@@ -208,6 +235,15 @@ def test_success_on_edges_is_the_share_that_is_walked(push, roadmap):
     assert edge_success(env, push(), UMAZE, tasks, jax.random.key(0)) > 0.95
     still = np.linalg.norm(tasks.start - tasks.goal, axis=1) < 0.5  # there from the first
     assert edge_success(env, push(0.0), UMAZE, tasks, jax.random.key(0)) == pytest.approx(still.mean())
+
+
+def test_edges_in_a_row_end_with_the_first_that_is_not_walked(push, roadmap):
+    env = MazeEnv(POINT, engine="mujoco", maps=False, horizon=30)
+    tasks = chain_tasks(split_edges(roadmap, 0.1, 0)[0], seed=0)
+    share = functools.partial(edges_in_a_row, env, maze=UMAZE, tasks=tasks, key=jax.random.key(0), walkers=50)
+    found = [share(push(), edges=edges) for edges in (1, 4, 8)]  # 30 steps are too few for some edges
+    assert 1 >= found[0] > found[1] > found[2] > 0
+    assert share(push(0.0), edges=4) < 0.1
 
 
 def test_the_controller_is_the_policy_without_chance(sac, fresh):
@@ -270,7 +306,8 @@ def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, roadmap):
     after = jax.jit(jax.vmap(sac.env.step))(state, jnp.ones((64, 2)))
     over = (np.arange(64) % 4 == 0) | (np.asarray(after.done) > 0)
     seen = [jnp.concatenate([s.obs["proprio"], s.obs["goal"]], -1) for s in (state, after)]
-    batch = Transition(seen[0], jnp.ones((64, 2)), jax.jit(sac._reward)(state, after), 1.0 - over, seen[1], {})
+    action = jnp.ones((64, 2))
+    batch = Transition(seen[0], action, jax.jit(sac._reward)(state, action, after), 1.0 - over, seen[1], {})
     told = sac._relabel(batch, jax.random.key(0))
     changed = np.asarray((told.observation != batch.observation).any(-1))
     assert not changed[over].any() and 0.4 < changed[~over].mean() < 0.8
@@ -285,6 +322,26 @@ def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, roadmap):
     dense = (before - left) / 0.1 if kind == "velocity" else -left
     np.testing.assert_allclose(told.reward[changed], dense + config.arrival_bonus * arrived, atol=1e-3)
     np.testing.assert_array_equal(told.discount[changed], 1.0 - arrived)
+
+
+def test_through_an_arrival_the_value_goes_on():
+    """To the goal after it, which is out of reach yet; only falls end it."""
+    config = replace(TINY, envs=64, relabel=0.6, relabel_m=1.0, chain=True, through=True)
+    sac = make(config)
+    at = jax.random.uniform(jax.random.key(0), (64, 2), minval=-0.3, maxval=0.3)
+    seen, now = (jnp.concatenate([jnp.zeros((64, 2)), goal], -1) for goal in (at, at - 0.1))
+    fall = (jnp.arange(64) % 4 == 0).astype(jnp.float32)
+    arrived = (jnp.arange(64) % 4 == 1).astype(jnp.float32)
+    batch = Transition(seen, jnp.zeros((64, 2)), jnp.zeros(64), 1.0 - fall - arrived, now,
+                       {"state_extras": {"truncation": 0 * fall, "fall": fall}})  # fmt: skip
+    told = sac._present(batch, UMAZE, jax.random.key(1))
+    np.testing.assert_array_equal(told.discount, 1.0 - fall)
+    changed = np.asarray((told.observation != batch.observation).any(-1))
+    assert 0.3 < changed.mean() < 0.6 and not changed[np.asarray(fall + arrived) > 0].any()
+    away = np.linalg.norm(told.next_observation[changed, -2:], axis=-1)
+    assert away.min() >= POINT.goal_tolerance_m and (np.asarray(told.reward)[changed] > 9).any()  # the bonus of some
+    with pytest.raises(UserError, match="set chain=True"):
+        make(replace(config, chain=False))
 
 
 def test_a_fall_costs_more_and_more():

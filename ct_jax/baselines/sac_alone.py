@@ -22,6 +22,9 @@ from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.controllers.sac import Sac, SacConfig
 
+# Settings of ``SacConfig`` that mean something to a controller on edges only, and what they must be here.
+EDGES_ONLY: dict[str, Any] = {"chain": False, "through": False, "turn_ramp": None, "mirror": False, "relabel": 0.0}
+
 
 class SacAlone(Sac):
     """The learner: ``Sac``, which also sees the local map. ``hidden[0]`` is the width of its networks."""
@@ -29,10 +32,10 @@ class SacAlone(Sac):
     kept = 4
 
     def __init__(self, env: MazeEnv, config: SacConfig):
-        if config.mirror or config.chain or config.relabel:
-            raise UserError(
-                "SAC alone learns from its own steps and from fresh starts: set mirror and chain to False, relabel to 0"
-            )
+        set_to = {name: value for name, value in EDGES_ONLY.items() if getattr(config, name) != value}
+        if set_to:
+            mend = ", ".join(f"{name}={value}" for name, value in set_to.items())
+            raise UserError(f"SAC alone learns from its own steps and from fresh starts: set {mend}")
         super().__init__(env, config)
         self.reward = "distance"
 

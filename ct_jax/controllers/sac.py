@@ -354,10 +354,10 @@ class Sac:
         Steps that ended an episode stay as they are: the goal after them is the next one's.
         """
         config, tolerance = self.config, self.env.robot.goal_tolerance_m
-        which_key, angle_key, far_key = jax.random.split(key, 3)
+        which_key, *goal_keys = jax.random.split(key, 3)
         shape = batch.reward.shape
         chosen = jax.random.bernoulli(which_key, config.relabel, shape) & (batch.discount > 0)
-        goal = self._draw_goals(angle_key, far_key, shape)
+        goal = self._draw_goals(goal_keys, shape)
         old, old_after = batch.observation[:, -2:], batch.next_observation[:, -2:]
         after = goal - (old - old_after)
         length = lambda vectors: jnp.linalg.norm(vectors, axis=-1)  # noqa: E731
@@ -365,8 +365,8 @@ class Sac:
         reward = batch.reward - self._towards(length(old), length(old_after)) + config.arrival_bonus * arrived
         reward += self._towards(length(goal), length(after))
         if config.through:
-            next_keys = jax.random.split(jax.random.fold_in(key, 1))
-            after = jnp.where(arrived[:, None], self._draw_goals(*next_keys, shape), after)
+            next_goal = self._draw_goals(list(jax.random.split(jax.random.fold_in(key, 1))), shape)
+            after = jnp.where(arrived[:, None], next_goal, after)
 
         def put(seen: jax.Array, goals: jax.Array) -> jax.Array:
             return jnp.where(chosen[:, None], jnp.concatenate([seen[:, :-2], goals], -1), seen)
@@ -378,8 +378,9 @@ class Sac:
             discount=jnp.where(chosen, 1.0 - arrived, batch.discount),
         )
 
-    def _draw_goals(self, angle_key: jax.Array, far_key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    def _draw_goals(self, keys: list[jax.Array], shape: tuple[int, ...]) -> jax.Array:
         """Goals all around the robot, out of reach yet [m]."""
+        angle_key, far_key = keys
         angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
         nearest, farthest = self.env.robot.goal_tolerance_m, self.config.relabel_m
         distance = jax.random.uniform(far_key, shape, minval=nearest, maxval=farthest)
