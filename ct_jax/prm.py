@@ -6,7 +6,7 @@ over a ``Maze``, or any other ``Space``.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import jax
@@ -83,23 +83,38 @@ class Space(Protocol):
 
 @dataclass(frozen=True)
 class Roadmap:
-    """A graph over collision-free points. Nodes are 0 ... n-1; edges carry their length as ``weight`` [m]."""
+    """A graph over collision-free points. Nodes are 0 ... n-1."""
 
-    graph: nx.Graph
     points: np.ndarray  # float32 [n, 2], [m]
     edges: np.ndarray  # int32 [m, 2], each once, first < second
     maze: Maze | Space
     radius_m: float  # of the robot; every edge keeps it clear, and edges between samples the margin too
     config: PrmConfig
 
+    @property
+    def length(self) -> np.ndarray:
+        """Lengths float32 [m] of the edges (m)."""
+        return np.linalg.norm(self.points[self.edges[:, 0]] - self.points[self.edges[:, 1]], axis=1)
+
+    @functools.cached_property
+    def graph(self) -> nx.Graph:
+        """The roadmap for networkx; edges carry their length as ``weight`` [m]."""
+        graph = nx.Graph()
+        graph.add_nodes_from(range(len(self.points)))
+        graph.add_weighted_edges_from(zip(*self.edges.T.tolist(), self.length.tolist(), strict=True))
+        return graph
+
+    @functools.cached_property
+    def _weights(self) -> csr_array:
+        """Lengths of the edges, each in both directions: for csgraph, a directed graph (half the work of its other)."""
+        both = np.concatenate([self.edges, self.edges[:, ::-1]])
+        return csr_array((np.tile(self.length, 2), (both[:, 0], both[:, 1])), shape=(len(self.points),) * 2)
+
     @functools.cached_property
     def table(self) -> PlanTable:
         """Next hops and distances between all pairs of points."""
         n = len(self.points)
-        length = np.linalg.norm(self.points[self.edges[:, 0]] - self.points[self.edges[:, 1]], axis=1)
-        both = np.concatenate([self.edges, self.edges[:, ::-1]])
-        weights = csr_array((np.tile(length, 2), (both[:, 0], both[:, 1])), shape=(n, n))
-        distance, predecessor = dijkstra(weights, directed=False, return_predecessors=True)
+        distance, predecessor = dijkstra(self._weights, return_predecessors=True)
         # The point before i on a path from j is, the graph being undirected, the one after i on the way to j.
         next_hop = np.where(predecessor.T < 0, NO_HOP, predecessor.T).astype(np.int16)
         np.fill_diagonal(next_hop, np.arange(n))
@@ -108,16 +123,18 @@ class Roadmap:
     def plan(self, start: np.ndarray, goal: np.ndarray) -> Path | NoPath:
         """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
         ends = np.asarray([start, goal], np.float32)
-        for name, point in zip(("start", "goal"), ends, strict=True):
-            if not float(as_space(self.maze).clearance(point[None])[0]) >= self.radius_m:
+        for name, room in zip(("start", "goal"), as_space(self.maze).clearance(ends), strict=True):
+            if not room >= self.radius_m:
                 return NoPath(tuple(ends[0]), tuple(ends[1]), f"the {name} is inside a wall or touches one")
         grown = extend(self, ends)
-        n = len(self.points)
-        try:
-            nodes = nx.shortest_path(grown.graph, n, n + 1, weight="weight")
-        except nx.NetworkXNoPath:
+        first, last = len(self.points), len(self.points) + 1
+        distance, before = dijkstra(grown._weights, indices=first, return_predecessors=True)
+        if not np.isfinite(distance[last]):
             return NoPath(tuple(ends[0]), tuple(ends[1]), "no chain of free roadmap edges joins them")
-        points = grown.points[nodes]
+        nodes = [last]
+        while nodes[-1] != first:
+            nodes.append(before[nodes[-1]])
+        points = grown.points[nodes[::-1]]
         return Path(points, float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
 
 
@@ -136,28 +153,30 @@ def build_roadmap(key: jax.Array, maze: Maze | Space, *, radius_m: float, config
     seed = np.asarray(jax.random.key_data(key)).astype(np.uint32)
     rng = np.random.default_rng(seed)
     points = as_space(maze).sample_free(rng, config.samples, radius).astype(np.float32)
-    return _connect(points, maze, radius_m, config)
+    nothing = Roadmap(points[:0], np.zeros((0, 2), np.int32), maze, radius_m, config)
+    return extend(nothing, points)
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     """The roadmap with further points [k, 2] (m), appended in order and connected wherever the bare robot fits."""
-    everything = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
-    return _connect(everything, roadmap.maze, roadmap.radius_m, roadmap.config)
+    known = len(roadmap.points)
+    points = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
+    pairs = _new_pairs(points, known, roadmap.config.connect_m)
+    # Between samples the margin is kept; to given points only the radius.
+    clear = roadmap.radius_m + roadmap.config.margin_m * (pairs < roadmap.config.samples).all(1)
+    free = as_space(roadmap.maze).segment_free(points[pairs[:, 0]], points[pairs[:, 1]], clear)
+    return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs[free]]))
 
 
-def _connect(points: np.ndarray, maze: Maze | Space, radius_m: float, config: PrmConfig) -> Roadmap:
-    """Join all pairs of points within the connect distance whose straight way is free, in one batched check.
-
-    Edges between the first ``config.samples`` points keep the margin; the others, to given points, only the radius.
-    """
-    pairs = cKDTree(points).query_pairs(config.connect_m, output_type="ndarray").astype(np.int32)
-    clear = radius_m + config.margin_m * (pairs < config.samples).all(1)
-    edges = pairs[as_space(maze).segment_free(points[pairs[:, 0]], points[pairs[:, 1]], clear)]
-    graph = nx.Graph()
-    graph.add_nodes_from(range(len(points)))
-    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    graph.add_weighted_edges_from(zip(edges[:, 0].tolist(), edges[:, 1].tolist(), length.tolist(), strict=True))
-    return Roadmap(graph, points, edges, maze, radius_m, config)
+def _new_pairs(points: np.ndarray, known: int, reach_m: float) -> np.ndarray:
+    """Pairs int32 [k, 2] of points at most ``reach_m`` [m] apart, first < second, the second not among the known."""
+    tree = cKDTree(points)
+    if not known:
+        return tree.query_pairs(reach_m, output_type="ndarray").astype(np.int32)
+    near = tree.query_ball_point(points[known:], reach_m)
+    second = np.repeat(np.arange(known, len(points)), [len(each) for each in near])
+    pairs = np.stack([np.concatenate([*near, []]), second], 1).astype(np.int32)
+    return pairs[pairs[:, 0] < pairs[:, 1]]
 
 
 def as_space(maze: Maze | Space) -> Space:
@@ -177,11 +196,39 @@ class MazeSpace:
 
     def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """As ``Space`` says."""
-        n, longest = len(a), float(np.linalg.norm(b - a, axis=-1).max(initial=0.0))
-        reach = segment_reach(longest, float(np.max(radius, initial=0.0)), float(self.maze.cell_m))
-        ends, clear = np.zeros((_bucket(n), 2, 2), np.float32), np.zeros(_bucket(n), np.float32)
-        ends[:n, 0], ends[:n, 1], clear[:n] = a, b, radius
-        return np.asarray(_segments_free(self.maze, jnp.asarray(ends), jnp.asarray(clear), reach))[:n]
+        free, unclear = self._by_cells(a, b, radius)
+        ends, clear = np.stack([a, b], 1)[unclear], np.asarray(radius)[unclear]
+        longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).max(initial=0.0))
+        reach = segment_reach(longest, float(clear.max(initial=0.0)), float(self.maze.cell_m))
+        parts = []
+        for begin in range(0, len(ends), _BLOCK):  # in blocks that stay in the cache and share one program
+            n = len(ends[begin : begin + _BLOCK])
+            block, room = np.zeros((_bucket(n), 2, 2), np.float32), np.zeros(_bucket(n), np.float32)
+            block[:n], room[:n] = ends[begin : begin + n], clear[begin : begin + n]
+            parts.append(_segments_free(self.maze, jnp.asarray(block), jnp.asarray(room), reach))
+        free[unclear] = np.concatenate([np.zeros(0, bool), *map(np.asarray, parts)])[: len(ends)]
+        return free
+
+    def _by_cells(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the cells alone tell of segments: which are free for certain, and which want the exact check.
+
+        A segment is free where the box around it holds no wall, and is not where its middle or a quarter is in one.
+        """
+        walls, cell = np.asarray(self.maze.walls), float(self.maze.cell_m)
+        counts = np.pad(walls.cumsum(0).cumsum(1), ((1, 0), (1, 0)))  # of walls below and left
+
+        def index(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            cells = np.floor(points / cell).astype(np.int64)  # the border is wall, and so is everything beyond it
+            return np.clip(cells[..., 1], 0, walls.shape[0] - 1), np.clip(cells[..., 0], 0, walls.shape[1] - 1)
+
+        around = np.asarray(radius)[:, None] + 1e-4  # more than rounding: never free where the exact check would not be
+        (bottom, left), (top, right) = index(np.minimum(a, b) - around), index(np.maximum(a, b) + around)
+        top, right = top + 1, right + 1
+        free = counts[top, right] - counts[bottom, right] - counts[top, left] + counts[bottom, left] == 0
+        blocked = np.zeros_like(free)
+        for share in (0.5, 0.25, 0.75):
+            blocked |= walls[index(a + share * (b - a))]
+        return free, ~free & ~blocked
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
         """As ``Space`` says. Raises UserError where the cells are too narrow."""
@@ -191,6 +238,9 @@ class MazeSpace:
 def _bucket(n: int) -> int:
     """Sizes of compiled edge checks: powers of two, so that few programs serve all roadmaps."""
     return max(1024, 1 << (n - 1).bit_length())
+
+
+_BLOCK = 8192  # most edges that are checked at once
 
 
 @functools.partial(jax.jit, static_argnames="reach")
