@@ -1,27 +1,71 @@
-"""Paired timings, printed as a table and written to ``benchmarks/results/NAME.json``."""
+"""What all benchmarks share: contestants timed in turn, a table, ``results/NAME.json``, the table in the docstring.
 
+The table at the end of a benchmark's docstring is made from its results and nothing else.
+"""
+
+import ast
+import importlib.util
+import io
 import json
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import jax
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from ct_jax.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
+PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")
+LAST = "\n\nLast results, "
+_WIDTH = 116
 
 
-def time_pairs(
-    ours: Callable[[], object], other: Callable[[], object], *, repeat: int = 15
-) -> tuple[list[float], list[float]]:
-    """Seconds of both, taken in turn (A B A B ...) after one warm-up each, so that a drifting machine hurts neither."""
-    times: tuple[list[float], list[float]] = ([], [])
+@dataclass(frozen=True)
+class Options:
+    """What all benchmarks can be asked."""
+
+    full: bool = False
+    """The long sweeps, too."""
+    repeat: int = 7
+    """Rounds, in each of which every contestant has its turn."""
+    write: bool = True
+    """Keep the results, and the table in the docstring; without it they are only printed."""
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """Something to be timed."""
+
+    run: Callable[[], object]
+    work: float = 1.0  # of one call, in the unit that is counted
+
+
+def has_peer(module: str, name: str) -> bool:
+    """Whether a peer is installed; says so where it is not."""
+    there = importlib.util.find_spec(module) is not None
+    if not there:
+        print(f"{name} is not installed, so it is not measured: pip install -e '.[bench]'")
+    return there
+
+
+def about(docstring: str | None) -> str:
+    """A docstring without its table."""
+    return (docstring or "").split(LAST)[0]
+
+
+def time_together(*functions: Callable[[], object], repeat: int) -> list[list[float]]:
+    """Seconds of each, taken in turn (A B C A B C ...) after one warm-up, so that a drifting machine hurts none."""
+    times: list[list[float]] = [[] for _ in functions]
     for round_ in range(repeat + 1):
-        for function, taken in zip((ours, other), times, strict=True):
+        for function, taken in zip(functions, times, strict=True):
             begun = time.perf_counter()
             jax.block_until_ready(function())
             if round_:
@@ -29,42 +73,108 @@ def time_pairs(
     return times
 
 
-def time_alone(function: Callable[[], object], *, repeat: int = 15) -> list[float]:
-    """Seconds of each call after one warm-up."""
-    return time_pairs(function, lambda: None, repeat=repeat)[0]
+_FIGURES: dict[str, Callable[[float, float], float]] = {
+    "ms": lambda seconds, work: 1000.0 * seconds / work,
+    "µs": lambda seconds, work: 1e6 * seconds / work,
+    "s": lambda seconds, work: seconds / work,
+}
 
 
-def _figure(value: float) -> str:
-    return f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"
+def _spread(values: list[float]) -> dict[str, float]:
+    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
 
 
 class Results:
-    """Rows of one benchmark."""
+    """Rows of one benchmark, ``file``."""
 
-    def __init__(self, name: str):
-        self.name = name
-        self._rows: list[dict] = []
+    def __init__(self, file: str, options: Options):
+        self.file, self.options = Path(file), options
+        self._rows: list[dict[str, Any]] = []
 
-    def add(self, name: str, unit: str, values: list[float], *, against: str = "", ratios: list[float] | None = None):
-        """One figure: all its values, and pair by pair its ratio to something else."""
-        row = {"name": name, "value": statistics.median(values), "unit": unit, "min": min(values), "max": max(values)}
-        ratio = {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)} if ratios else None
-        self._rows.append(row | {"against": against, "ratio": ratio})
+    def add(
+        self, name: str, unit: str, values: list[float], *, against: str = "", other: list[float] | None = None,
+        ratios: list[float] | None = None, asked: float | None = None,
+    ) -> None:  # fmt: skip
+        """One figure: all its values; what it stands against with its values, pair by pair the ratio, and the least
+        ratio that is asked for."""
+        spread = _spread(values)
+        row = {"name": name, "value": spread.pop("median"), "unit": unit} | spread | {"against": against}
+        row |= {"other": statistics.median(other) if other else None, "ratio": _spread(ratios) if ratios else None}
+        self._rows.append(row | {"asked": asked})
+
+    def race(
+        self, name: str, unit: str, ours: Contestant, others: dict[str, Contestant] | None = None, *,
+        asked: dict[str, float] | None = None, repeat: int | None = None,
+    ) -> list[float]:  # fmt: skip
+        """Time ours and all others together: a row for each other, with how many times as fast as it ours is.
+
+        Args:
+            unit: "ms", "µs" or "s" for a unit of work, or of work in a second ("steps/s").
+            asked: the least such ratio, by the other's name.
+
+        Returns:
+            Our seconds.
+        """
+        others, asked = others or {}, asked or {}
+        figure = _FIGURES.get(unit, lambda seconds, work: work / seconds)
+        every = [ours, *others.values()]
+        times = time_together(*(each.run for each in every), repeat=repeat or self.options.repeat)
+        values = [[figure(t, each.work) for t in taken] for each, taken in zip(every, times, strict=True)]
+        for (label, rival), taken, other in zip(others.items(), times[1:], values[1:], strict=True):
+            speeds = [(ours.work / a) / (rival.work / b) for a, b in zip(times[0], taken, strict=True)]
+            self.add(name, unit, values[0], against=label, other=other, ratios=speeds, asked=asked.get(label))
+        if not others:
+            self.add(name, unit, values[0])
+        print(f"{name}: {statistics.median(values[0]):.4g} {unit}", flush=True)
+        return times[0]
 
     def finish(self) -> None:
-        """Print the table and write the file."""
+        """Print the table, and write it down."""
         made = provenance()
-        table = Table(title=f"{self.name}: {made['hardware']}, jax {made['versions']['jax']}, commit {made['commit']}")
-        for column in ("what", "median", "min", "max", "unit", "against", "ratio (min-max)"):
-            table.add_column(column, justify="left" if column in ("what", "unit", "against") else "right")
-        for row in self._rows:
-            ratio = row["ratio"]
-            table.add_row(
-                row["name"], *(_figure(row[name]) for name in ("value", "min", "max")),
-                row["unit"], row["against"],
-                f"{ratio['median']:.2f} ({ratio['min']:.2f}-{ratio['max']:.2f})" if ratio else "",
-            )  # fmt: skip
-        Console(width=140).print(table)
-        RESULTS.mkdir(exist_ok=True)
+        made["versions"] |= {name: metadata.version(name) for name in PEERS if _installed(name)}
         rows = [row | {"made": made} for row in self._rows]
-        (RESULTS / f"{self.name}.json").write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+        print(table_of(rows))
+        if self.options.write:
+            RESULTS.mkdir(exist_ok=True)
+            (RESULTS / f"{self.file.stem}.json").write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+            self.file.write_text(with_table(self.file.read_text("utf-8"), table_of(rows)), "utf-8")
+
+
+def _installed(name: str) -> bool:
+    try:
+        return bool(metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return False
+
+
+def _number(value: float) -> str:
+    return f"{value:,.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+
+
+def table_of(rows: list[dict[str, Any]]) -> str:
+    """Results as a heading and a table in plain text, no line longer than the sources' are."""
+    made = rows[0]["made"]
+    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
+    table = Table(box=box.MARKDOWN)
+    for column in ("what", "median (min-max)", "unit", "against", "its", "times (min-max)", "asked"):
+        table.add_column(column)
+    for row in rows:
+        ratio, optional = row["ratio"], lambda value: "" if value is None else _number(value)
+        figures = f"{_number(row['value'])} ({_number(row['min'])}-{_number(row['max'])})"
+        times = f"{ratio['median']:.2f} ({ratio['min']:.2f}-{ratio['max']:.2f})" if ratio else ""
+        table.add_row(
+            row["name"], figures, row["unit"], row["against"], optional(row["other"]), times, optional(row["asked"])
+        )
+    console = Console(width=_WIDTH, file=io.StringIO(), color_system=None)
+    console.print(f"{made['created'][:10]}, commit {made['commit']}, {made['hardware']}: {versions}\n", highlight=False)
+    console.print(table)
+    return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines()).strip()  # pyright: ignore
+
+
+def with_table(source: str, table: str) -> str:
+    """A Python source with the table at the end of its docstring, in place of the one there."""
+    docstring = ast.parse(source).body[0]
+    lines = source.splitlines(keepends=True)
+    text, rest = "".join(lines[: docstring.end_lineno]), "".join(lines[docstring.end_lineno :])
+    head = about(text.rstrip().removesuffix('"""')).rstrip()
+    return f'{head}{LAST}{table}\n"""\n{rest}'

@@ -1,60 +1,128 @@
-"""One acting step of a transformer for many environments: key/value cache against recomputing the window.
+"""One acting step of a transformer in many environments: key/value cache against recomputing the window.
 
-python benchmarks/acting.py [--preset demo] [--envs 100] [--context 50]
+    python benchmarks/acting.py [--full]
+
+Ours computes the three new tokens and looks back at cached keys and values; the window is full. Recomputing runs all 3K
+tokens again, which is how Hugging Face's Decision Transformer acts (torch; same widths, and a CNN as ours in front).
+``cpu`` is the model of that preset, ``paper`` the paper's. Sizes at which a contestant would want more memory than
+``--memory-gb``, or recomputing more than ``--recompute-steps`` tokens' states, are left out for it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tyro
-from _table import Results, time_pairs
+from _harness import Contestant, Options, Results, about, has_peer
 
 from ct_jax.presets import get_preset
-from ct_jax.transformer import ControlTransformer, empty_cache, sample_inputs
+from ct_jax.transformer import TOKENS, ControlTransformer, ModelConfig, empty_cache, sample_inputs
+
+PROPRIO, ACTION = 27, 8  # the ant's
+RECOMPUTED = "recomputing the window"
+PEER = "Hugging Face, torch"
 
 
 @dataclass(frozen=True)
-class Options:
+class ActingOptions(Options):
     """Sizes of the benchmark."""
 
-    preset: str = "demo"
-    """Whose model."""
-    envs: int = 100
+    presets: tuple[str, ...] = ("cpu", "paper")
+    """Whose models."""
+    envs: tuple[int, ...] = (1, 100, 4096)
     """Environments."""
-    context: int = 50
+    contexts: tuple[int, ...] = (5, 50, 200)
     """K."""
+    memory_gb: float = 6.0
+    """Largest cache."""
+    recompute_steps: int = 20_500
+    """Most environments times K that are recomputed."""
 
 
-def main(options: Options) -> None:
+def main(options: ActingOptions) -> None:
     """Run and print."""
-    config = replace(get_preset(options.preset).model, context=options.context, context_acting=options.context)
-    model = ControlTransformer(config, 2)
-    params = jax.jit(model.init)(jax.random.key(0), *sample_inputs(2, 2))
-    n, k = options.envs, options.context
-    keys = jax.random.split(jax.random.key(1), 4)
-    maps = jax.random.bernoulli(keys[0], 0.5, (n, k, 2, 25, 25)).astype(jnp.float32)
-    proprio, goal, action = (jax.random.normal(key, (n, k, 2)) for key in keys[1:])
-    rtg, valid = -100.0 * jnp.ones((n, k)), jnp.ones((n, k))
-    timestep = jnp.broadcast_to(jnp.arange(k), (n, k))
-
-    @jax.jit
-    def recompute(params):
-        return model.apply(params, maps, proprio, goal, action, rtg, timestep, valid)[:, -1]  # pyright: ignore
-
-    @jax.jit
-    def act(params, cache):
-        return model.apply(params, cache, maps[:, 0], proprio[:, 0], goal[:, 0], rtg[:, 0], method="act")
-
-    # a full window: every place of the ring is in use
-    cache = empty_cache(config, 2, n).replace(now=jnp.array(2 * k))
-    ours, other = time_pairs(lambda: act(params, cache), lambda: recompute(params))
-    results = Results("acting")
-    ratios = [b / a for a, b in zip(ours, other, strict=True)]
-    what = f"{options.preset} model, {n} environments, K={k}: one step"
-    results.add(what, "ms", [1000 * t for t in ours], against="recomputing the window", ratios=ratios)
+    results = Results(__file__, options)
+    torch = has_peer("torch", PEER) and has_peer("transformers", PEER)
+    for preset in options.presets:
+        for n in options.envs:
+            for context in options.contexts:
+                # The paper's own K and the middle size, unless all are asked for.
+                if preset != "paper" or options.full or (n == 100 and context == max(options.contexts)):
+                    measure(preset, n, context, torch, options, results)
     results.finish()
 
 
+def measure(preset: str, n: int, context: int, torch: bool, options: ActingOptions, results: Results) -> None:
+    """The rows of one size."""
+    config = replace(get_preset(preset).model, context=context, context_acting=context)
+    name = f"{preset} model, {n} environments, K={context}"
+    gigabytes = 2 * config.layers * n * TOKENS * (context + 1) * config.width * 4 / 1e9
+    if gigabytes > options.memory_gb:
+        print(f"{name}: a cache of {gigabytes:.0f} GB; not measured (--memory-gb)")
+        return
+    model = ControlTransformer(config, ACTION)
+    params = jax.jit(model.init)(jax.random.key(0), *sample_inputs(PROPRIO, ACTION))
+    steps = 10
+    ours = Contestant(cached(model, params, n, steps), steps)
+    others = {}
+    if n * context <= options.recompute_steps:
+        inputs = window(n, context)
+        others[RECOMPUTED] = Contestant(recomputed(model, params, inputs))
+        if torch:
+            others[PEER] = peer(config, inputs)
+    asked = {PEER: 100.0} if (preset, n, context) == ("paper", 100, 200) else {}
+    slow = config.width * n * context > 1e6
+    results.race(name, "ms", ours, others, asked=asked, repeat=min(2, options.repeat) if slow else None)
+
+
+def window(n: int, steps: int) -> dict[str, np.ndarray]:
+    """What n environments have seen in their last steps."""
+    rng = np.random.default_rng(0)
+    normal = lambda size: rng.normal(size=(n, steps, size)).astype(np.float32)  # noqa: E731
+    return {
+        "map": (rng.random((n, steps, 2, 25, 25)) < 0.5).astype(np.uint8), "proprio": normal(PROPRIO),
+        "goal": normal(2), "action": normal(ACTION), "rtg": np.full((n, steps), -100.0, np.float32),
+        "timestep": np.tile(np.arange(steps), (n, 1)), "valid": np.ones((n, steps), np.float32),
+    }  # fmt: skip
+
+
+def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callable[[], object]:
+    """Some steps with the cache, as a rollout takes them: in one program, the cache updated in place."""
+    now = {name: jnp.asarray(array[:, 0]) for name, array in window(n, 1).items()}
+
+    @jax.jit
+    def act(params, cache):
+        def step(cache, _):
+            action, cache = model.apply(
+                params, cache, now["map"], now["proprio"], now["goal"], now["rtg"], method="act"
+            )  # pyright: ignore
+            return cache, action
+
+        return jax.lax.scan(step, cache, length=steps)[1]
+
+    # a full window: every place of the ring is in use
+    cache = empty_cache(model.config, ACTION, n).replace(now=jnp.array(2 * model.config.context_acting))
+    return lambda: act(params, cache)
+
+
+def recomputed(model: ControlTransformer, params: Any, inputs: dict[str, np.ndarray]) -> Callable[[], object]:
+    """The last action of a window, all of it computed."""
+    arrays = {name: jnp.asarray(array) for name, array in inputs.items()}
+    arrays["maps"] = arrays.pop("map")
+    act = jax.jit(lambda params, arrays: model.apply(params, **arrays)[:, -1])  # pyright: ignore
+    return lambda: act(params, arrays)
+
+
+def peer(config: ModelConfig, inputs: dict[str, np.ndarray]) -> Contestant:
+    """The peer on the same window."""
+    from _decision_transformer import PeerTransformer, act, batch_of
+
+    model, batch = PeerTransformer(config, PROPRIO, ACTION, inputs["rtg"].shape[1]), batch_of(**inputs)
+    return Contestant(lambda: act(model, batch))
+
+
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    main(tyro.cli(ActingOptions, description=about(__doc__)))

@@ -1,30 +1,237 @@
-"""Time to build a roadmap and its next-hop table, warm, in ``antmaze-large``; the paper's is 200 samples, 10 m.
+"""Roadmaps in ``antmaze-large`` (connect distance 10 m): building, the next-hop table, and plans between two points.
 
-python benchmarks/prm.py
+    python benchmarks/prm.py [--full]
+
+Against two peers on the same maze. *Python loop* is the same roadmap as one would write it down with networkx: a loop
+over pairs of points, over the wall cells near each, and over the goals of the table. *OMPL* is its PRM with the
+number of samples and of neighbours that ours has on average, states checked by a Python function, as PyPI's package
+has it; it samples its edges every 0.1 m, where ours are exact, and has no table.
 """
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import jax
-from _table import Results, time_alone
+import networkx as nx
+import numpy as np
+import tyro
+from _harness import Contestant, Options, Results, about, has_peer
 
 from ct_envs import load_maze
-from ct_jax.prm import PrmConfig, build_roadmap
+from ct_envs.maze import Maze
+from ct_jax.prm import PrmConfig, Roadmap, as_space, build_roadmap
+
+RADIUS_M = 0.5
+LOOP = "Python loop"
+OMPL = "OMPL"
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class PrmOptions(Options):
+    """Sizes of the benchmark."""
+
+    samples: tuple[int, ...] = (100, 200, 1000, 5000)
+    """Points of the roadmaps."""
+    table_up_to: int = 1000
+    """Points up to which the table is measured (--full: all)."""
+    loop_up_to: int = 1000
+    """Points up to which the Python loop is measured (--full: all)."""
+    loop_table_up_to: int = 200
+    """Points up to which its table is (--full: 1000)."""
+
+
+def main(options: PrmOptions) -> None:
     """Run and print."""
-    results = Results("prm")
+    results = Results(__file__, options)
     maze = load_maze("antmaze-large")
-    for samples in (200, 1000):
-        seeds = iter(range(10**6))
-
-        def build(samples=samples, seeds=seeds):
-            key = jax.random.key(next(seeds))
-            return build_roadmap(key, maze, radius_m=0.5, config=PrmConfig(samples=samples)).table
-
-        taken = time_alone(build)
-        results.add(f"{samples} samples, d = 10 m: build and next-hop table", "ms", [1000 * t for t in taken])
+    ompl = has_peer("ompl", OMPL)
+    for samples in options.samples:
+        measure(maze, samples, ompl, options, results)
+    growth(maze, options, results)
     results.finish()
 
 
+def building(maze: Maze, samples: int) -> Callable[[], Roadmap]:
+    """A function that builds another roadmap at each call."""
+    seeds = iter(range(10**6))
+    config = PrmConfig(samples=samples)
+    return lambda: build_roadmap(jax.random.key(next(seeds)), maze, radius_m=RADIUS_M, config=config)
+
+
+def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: Results) -> None:
+    """The rows of one size."""
+    build = building(maze, samples)
+    roadmap = build()
+    walls, points = np.asarray(maze.walls).tolist(), roadmap.points.tolist()
+    cell, reach = float(maze.cell_m), roadmap.config.connect_m
+    looped = options.full or samples <= options.loop_up_to
+    loop = {LOOP: Contestant(lambda: loop_roadmap(points, walls, cell, reach))} if looped else {}
+    planner = OmplPlanner(maze, max(1, round(2 * len(roadmap.edges) / samples))) if ompl else None
+    fast = {OMPL: Contestant(lambda: planner.build(samples))} if planner else {}
+    asked = {OMPL: 2.0} if samples == 1000 else {}
+    results.race(f"{samples} samples: build", "ms", Contestant(lambda: build().edges), fast, asked=asked)
+    if loop:
+        slow = 2 if samples > 200 else None
+        asked = {LOOP: 50.0} if samples == 1000 else {}
+        build_too = Contestant(lambda: build().edges)
+        results.race(f"{samples} samples: build", "ms", build_too, loop, asked=asked, repeat=slow)
+    if options.full or samples <= options.table_up_to:
+        tabled = samples <= (1000 if options.full else options.loop_table_up_to)
+        graph = roadmap.graph
+        both = {LOOP: Contestant(lambda: (loop_roadmap(points, walls, cell, reach), loop_table(graph)))}
+        name = f"{samples} samples: build and table"
+        few = 1 if samples > 200 else 3
+        results.race(name, "ms", Contestant(lambda: build().table), both if tabled else {}, repeat=few)
+    query(maze, samples, roadmap, planner, results)
+
+
+def query(maze: Maze, samples: int, roadmap: Roadmap, planner: "OmplPlanner | None", results: Results) -> None:
+    """The row of plans between points that are not in the roadmap."""
+    ends = building(maze, 100)().points
+    pairs = list(zip(ends[::2], ends[1::2], strict=True))[:10]
+    walls, cell, reach = np.asarray(maze.walls).tolist(), float(maze.cell_m), roadmap.config.connect_m
+    graph, points = roadmap.graph.copy(), roadmap.points.tolist()
+    others = {
+        LOOP: Contestant(lambda: [loop_plan(graph, points, walls, cell, reach, *pair) for pair in pairs], len(pairs))
+    }
+    if planner is not None:
+        planner.build(samples)
+        others[OMPL] = Contestant(lambda: [planner.plan(*pair) for pair in pairs], len(pairs))
+    ours = Contestant(lambda: [roadmap.plan(*pair) and None for pair in pairs], len(pairs))
+    results.race(f"{samples} samples: a plan", "ms", ours, others, repeat=3)
+
+
+def growth(maze: Maze, options: PrmOptions, results: Results) -> None:
+    """How the time for an edge grows with the roadmap."""
+    small, large = (s for s in (200, max(options.samples)))
+    builds = [building(maze, small), building(maze, large)]
+    edges = [float(np.mean([len(build().edges) for _ in range(3)])) for build in builds]
+    few, many = (Contestant(lambda b=build: b().edges, n) for build, n in zip(builds, edges, strict=True))
+    name = f"growth: an edge at {large} samples"
+    results.race(name, "µs", many, {f"an edge at {small}": few}, asked={f"an edge at {small}": 1 / 1.3})
+
+
+# ------------------------------------------------------------------------------------------------- the Python loop
+
+
+def loop_free(a: list[float], b: list[float], walls: list[list[bool]], cell: float, radius: float) -> bool:
+    """Whether a disc swept from a to b stays clear of the wall cells."""
+    low = [math.floor((min(a[i], b[i]) - radius) / cell) for i in (0, 1)]
+    high = [math.floor((max(a[i], b[i]) + radius) / cell) for i in (0, 1)]
+    return all(
+        _to_box(a, b, column * cell, row * cell, cell) >= radius
+        for row in range(low[1], high[1] + 1)
+        for column in range(low[0], high[0] + 1)
+        if walls[row][column]
+    )
+
+
+def _to_box(a: list[float], b: list[float], left: float, bottom: float, side: float) -> float:
+    """Distance from a segment to a square."""
+    enter, leave = 0.0, 1.0
+    for start, along, low in ((a[0], b[0] - a[0], left), (a[1], b[1] - a[1], bottom)):
+        along = along or 1e-12
+        first, second = sorted(((low - start) / along, (low + side - start) / along))
+        enter, leave = max(enter, first), min(leave, second)
+    if enter <= leave:
+        return 0.0
+    nearest = math.inf
+    for x, y in (a, b):
+        nearest = min(nearest, math.hypot(max(left - x, x - left - side, 0.0), max(bottom - y, y - bottom - side, 0.0)))
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    for x, y in ((left, bottom), (left + side, bottom), (left, bottom + side), (left + side, bottom + side)):
+        t = min(max(((x - a[0]) * dx + (y - a[1]) * dy) / (dx * dx + dy * dy or 1e-12), 0.0), 1.0)
+        nearest = min(nearest, math.hypot(a[0] + t * dx - x, a[1] + t * dy - y))
+    return nearest
+
+
+def loop_roadmap(points: list[list[float]], walls: list[list[bool]], cell: float, reach: float) -> nx.Graph:
+    """The roadmap over the points."""
+    graph = nx.Graph()
+    graph.add_nodes_from(range(len(points)))
+    for j, b in enumerate(points):
+        for i, a in enumerate(points[:j]):
+            length = math.dist(a, b)
+            if length <= reach and loop_free(a, b, walls, cell, RADIUS_M):
+                graph.add_edge(i, j, weight=length)
+    return graph
+
+
+def loop_table(graph: nx.Graph) -> dict[int, dict[int, int]]:
+    """The next hop from every point (second) to every goal (first)."""
+    table = {}
+    for goal in graph:
+        before, _ = nx.dijkstra_predecessor_and_distance(graph, goal)
+        table[goal] = {node: nodes[0] for node, nodes in before.items() if nodes}
+    return table
+
+
+def loop_plan(
+    graph: nx.Graph, points: list[list[float]], walls: list[list[bool]], cell: float, reach: float,
+    start: np.ndarray, goal: np.ndarray,
+) -> list[Any]:  # fmt: skip
+    """A shortest path, start and goal joined to the roadmap for as long as it takes."""
+    for name, end in (("start", start.tolist()), ("goal", goal.tolist())):
+        for i, point in enumerate(points):
+            length = math.dist(end, point)
+            if length <= reach and loop_free(end, point, walls, cell, RADIUS_M):
+                graph.add_edge(name, i, weight=length)
+    path = nx.shortest_path(graph, "start", "goal", weight="weight")
+    graph.remove_nodes_from(("start", "goal"))
+    return path
+
+
+# ------------------------------------------------------------------------------------------------------------ OMPL
+
+
+class OmplPlanner:
+    """OMPL's PRM in the maze."""
+
+    def __init__(self, maze: Maze, neighbours: int):
+        from ompl import base, geometric, util  # pyright: ignore[reportMissingImports]
+
+        util.setLogLevel(util.LogLevel.LOG_ERROR)
+        self._base, self._geometric, self._neighbours = base, geometric, neighbours
+        sides = [float(maze.cell_m) * cells for cells in maze.shape[::-1]]
+        self._space = base.RealVectorStateSpace(2)
+        bounds = base.RealVectorBounds(2)
+        for axis, side in enumerate(sides):
+            bounds.setLow(axis, 0.0)
+            bounds.setHigh(axis, side)
+        self._space.setBounds(bounds)
+        # A grid of 0.1 m, blown up by the robot's radius once: no check of a state is quicker in Python.
+        x, y = (0.1 * (np.arange(round(10 * side)) + 0.5) for side in sides)
+        grid = np.stack(np.meshgrid(x, y), -1)
+        clear = as_space(maze).clearance(grid.reshape(-1, 2)).reshape(grid.shape[:2])
+        blocked = (clear < RADIUS_M).tolist()
+        self._information = base.SpaceInformation(self._space)
+        self._information.setStateValidityChecker(lambda state: not blocked[int(10 * state[1])][int(10 * state[0])])
+        self._information.setStateValidityCheckingResolution(0.1 / self._space.getMaximumExtent())
+        self._information.setup()
+
+    def build(self, samples: int) -> int:
+        """A roadmap of that many samples; returns its number of edges."""
+        self._prm = self._geometric.PRM(self._information)
+        self._prm.setMaxNearestNeighbors(self._neighbours)
+        self._prm.setProblemDefinition(self._base.ProblemDefinition(self._information))
+        self._prm.setup()
+        enough = self._base.PlannerTerminationCondition(lambda: self._prm.milestoneCount() >= samples)
+        self._prm.constructRoadmap(enough)
+        return self._prm.edgeCount()
+
+    def plan(self, start: np.ndarray, goal: np.ndarray) -> bool:
+        """Whether there is a path on the roadmap."""
+        problem = self._base.ProblemDefinition(self._information)
+        ends = [self._space.allocState() for _ in range(2)]
+        for state, point in zip(ends, (start, goal), strict=True):
+            state[0], state[1] = map(float, point)
+        problem.setStartAndGoalStates(*ends)
+        self._prm.clearQuery()
+        self._prm.setProblemDefinition(problem)
+        return bool(self._prm.solve(self._base.timedPlannerTerminationCondition(1.0)))
+
+
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(PrmOptions, description=about(__doc__)))

@@ -1,143 +1,283 @@
-"""Environment steps/s of ``MazeEnv`` under jit against raw ``mujoco.batch`` of the same model, and against peers.
+"""Environment steps/s of ``MazeEnv`` against raw physics and against peers, and planner-guided trajectories/s.
 
-    python benchmarks/rollout.py [--envs 256] [--steps 100]
+    python benchmarks/rollout.py [--full]
 
-Both sides take the same number of control steps with the same actions; ours adds walls, observations with maps, rewards
-and auto-reset. The peer is Gymnasium-Robotics' ant maze as it is run side by side, one process an environment, with as
-many of them as gives the most steps/s; it is measured where it is installed (``pip install -e '.[bench]'``). Its
-control step is five physics steps, as ours.
+Ours takes random actions under jit, as users run it; to the physics it adds walls, observations, rewards, auto-reset.
+*maps*: all observations; *proprio*: without local maps; *nothing*: none at all. The limit takes the same number of
+control steps of the same model with the same actions and does nothing else: ``mujoco.batch`` for the engine "mujoco"
+(on CPU), vmapped ``mjx.step`` for "mjx". Peers, each with an ant: Gymnasium-Robotics' and OGBench's ant mazes as they
+are run side by side, one process an environment, with as many as gives the most steps/s, and brax's own ant under vmap
+(without a maze or resets). A control step is five physics steps for all of them. *collection* is Algorithm 3 with the
+shipped controllers and the settings of the preset ``cpu``, roadmaps included.
 """
 
-import importlib.util
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
-from _table import Results, time_pairs
+from _harness import Contestant, Options, Results, about, has_peer
+from mujoco import mjx
 from mujoco.batch import Batch
 
-from ct_envs import MazeEnv, load_maze
+from ct_envs import MazeEnv, load_maze, stack_mazes
+from ct_jax.collect import collect
+from ct_jax.model import load_controller
+from ct_jax.presets import get_preset
+from ct_jax.run import cores
+
+MAZE = "antmaze-large"
+MIDDLE = 256  # environments at which all observations are compared, and peers
+GYMNASIUM = {
+    "Gymnasium-Robotics": ("gymnasium_robotics", "AntMaze_Large-v5"),
+    "OGBench": ("ogbench", "antmaze-large-v0"),
+}
 
 
 @dataclass(frozen=True)
-class Options:
+class RolloutOptions(Options):
     """Sizes of the benchmark."""
 
-    envs: int = 256
-    """Environments."""
-    steps: int = 100
-    """Control steps a call."""
+    envs: tuple[int, ...] = (1, 64, 256, 4096)
+    """Environments (--full: every power of two)."""
     robots: tuple[str, ...] = ("point", "ant")
     """Robots."""
-    peer: str = "AntMaze_Large-v5"
-    """Environment of Gymnasium-Robotics that the ant is compared with."""
+    work: int = 25_600
+    """Control steps of a call on the quick engine, all environments together; a fiftieth of it with MJX on CPU."""
+    peers: bool = True
+    """Whether peers are measured."""
     peer_envs: tuple[int, ...] = (1, 2, 4, 8, 16)
-    """Numbers of its environments that are tried."""
+    """Numbers of their environments that are tried."""
+    trajectories: int = 200
+    """Collected in a call; 0 for none."""
 
 
-def rollouts(env: MazeEnv, actions: jax.Array):
-    """A compiled function that takes all the actions in turn, as users run it."""
-
-    @jax.jit
-    def run(state):
-        def step(state, action):
-            state = jax.vmap(env.step)(state, action)
-            return state, state.reward  # the observations are in the carried state, so every step makes them
-
-        return jax.lax.scan(step, state, actions)
-
-    return run
-
-
-def prepare(robot: str, options: Options, *, maps: bool) -> tuple[MazeEnv, jax.Array, Any]:
-    """An environment, the actions of all steps, and the states before them."""
-    env = MazeEnv(robot, engine="mujoco", maze=load_maze("antmaze-large"), maps=maps)
-    shape = (options.steps, options.envs, env.action_size)
-    actions = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
-    return env, actions, jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), options.envs))
-
-
-def main(options: Options) -> None:
+def main(options: RolloutOptions) -> None:
     """Run and print."""
-    results = Results("rollout")
+    results = Results(__file__, options)
+    on_cpu = jax.default_backend() == "cpu"
+    envs = tuple(2**i for i in range(13)) if options.full else options.envs
     for robot in options.robots:
-        measure(robot, options, results)
-    if "ant" in options.robots:
-        if importlib.util.find_spec("gymnasium_robotics") is None:
-            print("Gymnasium-Robotics is not installed, so it is not measured: pip install -e '.[bench]'")
-        else:
-            measure_peer(options, results)
+        for n in envs:
+            for seen in ("maps", "proprio", "nothing") if n == MIDDLE else ("maps",):
+                measure(robot, "mujoco" if on_cpu else "mjx", n, seen, options, results)
+        if on_cpu:
+            measure(robot, "mjx", 64, "maps", options, results)
+        growth(robot, envs, options, results)
+    if "ant" in options.robots and options.peers:
+        measure_peers(options, results)
+    for robot in options.robots if options.trajectories else ():
+        collection(robot, options, results)
     results.finish()
 
 
-def measure(robot: str, options: Options, results: Results) -> None:
-    """The lines of one robot."""
-    for maps in (True, False):
-        env, actions, start = prepare(robot, options, maps=maps)
-        run = rollouts(env, actions)
-
-        batch = Batch(env.engine.model, nsim=options.envs)
-        ctrl, qpos = batch.bind("ctrl"), batch.bind("qpos")
-        qpos[:] = np.asarray(start.pipeline_state.qpos)
-        given = np.asarray(actions, np.float64)
-
-        def raw(batch=batch, ctrl=ctrl, given=given, substeps=env.engine.n_substeps):
-            for action in given:
-                ctrl[:] = action
-                batch.step(nstep=substeps)
-
-        ours, limit = time_pairs(lambda run=run, start=start: run(start), raw)
-        work = options.envs * options.steps
-        what = "with maps" if maps else "proprioception only"
-        results.add(
-            f"{robot}, {options.envs} environments, {what}", "steps/s", [work / t for t in ours],
-            against="raw mujoco.batch", ratios=[b / a for a, b in zip(ours, limit, strict=True)],
-        )  # fmt: skip
-        if not maps:
-            results.add(f"{robot}, raw mujoco.batch", "steps/s", [work / t for t in limit])
+def steps_of(engine: str, envs: int, options: RolloutOptions) -> int:
+    """Control steps a call."""
+    scale = 1.0 if engine == "mujoco" else 0.02 if jax.default_backend() == "cpu" else 40.0
+    return int(np.clip(scale * options.work / envs, 5, 400))
 
 
-def measure_peer(options: Options, results: Results) -> None:
-    """The line of Gymnasium-Robotics' ant maze, and ours against it."""
+@dataclass(frozen=True)
+class Prepared:
+    """An environment, the actions of all steps [T, N, A], and the states before them."""
+
+    env: MazeEnv
+    actions: jax.Array
+    start: Any
+
+    @property
+    def work(self) -> int:
+        return self.actions.shape[0] * self.actions.shape[1]
+
+
+def prepare(robot: str, engine: str, envs: int, options: RolloutOptions, *, maps: bool = True) -> Prepared:
+    """What a rollout needs."""
+    env = MazeEnv(robot, engine=engine, maze=load_maze(MAZE), maps=maps)
+    shape = (steps_of(engine, envs, options), envs, env.action_size)
+    actions = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
+    return Prepared(env, actions, jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), envs)))
+
+
+def rollout(ready: Prepared, *, observe: bool = True) -> Contestant:
+    """All the actions in turn, compiled."""
+    step = jax.vmap(ready.env.step)
+
+    @jax.jit
+    def run(state: Any, actions: jax.Array) -> Any:
+        def once(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+            after = step(state, action)
+            # The observations are in the carried state, so every step makes them: unless they are not carried.
+            return after if observe else after.replace(obs=state.obs), after.reward
+
+        return jax.lax.scan(once, state, actions)
+
+    return Contestant(lambda: run(ready.start, ready.actions), ready.work)
+
+
+def raw_mujoco(ready: Prepared) -> Contestant:
+    """The same physics steps in MuJoCo's threads."""
+    n, engine = ready.actions.shape[1], ready.env.engine
+    batch = Batch(engine.model, nsim=n, nthread=min(n, cores()))
+    ctrl, qpos, actions = batch.bind("ctrl"), batch.bind("qpos"), np.asarray(ready.actions, np.float64)
+    qpos[:] = np.asarray(ready.start.pipeline_state.qpos)
+
+    def run() -> None:
+        for action in actions:
+            ctrl[:] = action
+            batch.step(nstep=engine.n_substeps)
+
+    return Contestant(run, ready.work)
+
+
+def raw_mjx(ready: Prepared) -> Contestant:
+    """The same physics steps by XLA."""
+    engine = ready.env.engine
+    model = mjx.put_model(engine.model)
+    step = jax.vmap(mjx.step, in_axes=(None, 0))
+
+    @jax.jit
+    def run(qpos: jax.Array, actions: jax.Array) -> jax.Array:
+        data = jax.vmap(lambda qpos: mjx.make_data(model).replace(qpos=qpos))(qpos)
+
+        def once(data: Any, action: jax.Array) -> tuple[Any, None]:
+            data, _ = jax.lax.scan(
+                lambda d, _: (step(model, d), None), data.replace(ctrl=action), length=engine.n_substeps
+            )
+            return data, None
+
+        return jax.lax.scan(once, data, actions)[0].qpos
+
+    return Contestant(lambda: run(ready.start.pipeline_state.qpos, ready.actions), ready.work)
+
+
+LIMITS: dict[str, tuple[str, Callable[[Prepared], Contestant]]] = {
+    "mujoco": ("raw mujoco.batch", raw_mujoco),
+    "mjx": ("raw mjx.step", raw_mjx),
+}
+
+
+def measure(robot: str, engine: str, envs: int, seen: str, options: RolloutOptions, results: Results) -> None:
+    """The row of one size, against raw physics."""
+    ready = prepare(robot, engine, envs, options, maps=seen == "maps")
+    limit, raw = LIMITS[engine]
+    asked = {}
+    if (robot, seen) == ("ant", "maps"):
+        asked = {("mujoco", MIDDLE): {limit: 0.88}, ("mjx", 4096): {limit: 0.85}}.get((engine, envs), {})
+    ours = rollout(ready, observe=seen != "nothing")
+    results.race(f"{robot}, {engine}, {envs} envs, {seen}", "steps/s", ours, {limit: raw(ready)}, asked=asked)
+
+
+def growth(robot: str, envs: tuple[int, ...], options: RolloutOptions, results: Results) -> None:
+    """How the time for an environment's step grows with the number of environments."""
+    small, large = min(64, max(envs)), max(envs)
+    engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    few, many = (rollout(prepare(robot, engine, n, options)) for n in (small, large))
+    label = f"a step of {small}"
+    results.race(f"{robot}, growth: a step of {large}", "µs", many, {label: few}, asked={label: 1 / 1.3})
+
+
+def measure_peers(options: RolloutOptions, results: Results) -> None:
+    """The rows against other ants."""
+    others, close = {}, []
+    for name, (module, task) in GYMNASIUM.items():
+        if has_peer(module, name):
+            others[f"{name}, {task}"], envs = side_by_side(module, task, options)
+            close.append(envs)
+    ready = prepare("ant", "auto", MIDDLE, options)
+    others["brax ant, backend mjx"] = brax_ant("mjx", ready)
+    if options.full:
+        others["brax ant, backend generalized"] = brax_ant("generalized", ready)
+    asked = {name: 12.0 for name in others if name.startswith("Gymnasium")}
+    results.race(f"ant, {MIDDLE} envs, maps", "steps/s", rollout(ready), others, asked=asked)
+    for envs in close:
+        envs.close()
+
+
+def make_gymnasium(module: str, task: str) -> Any:
+    """A peer's environment."""
     import gymnasium  # pyright: ignore[reportMissingImports]
+
+    if module == "ogbench":
+        import ogbench  # pyright: ignore[reportMissingImports]
+
+        return ogbench.make_env_and_datasets(task, env_only=True)
     import gymnasium_robotics  # pyright: ignore[reportMissingImports]
 
     gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make(task)
 
-    def walk(n: int) -> tuple[Any, np.ndarray]:
-        envs = gymnasium.make_vec(options.peer, num_envs=n, vectorization_mode="async")
+
+def side_by_side(module: str, task: str, options: RolloutOptions) -> tuple[Contestant, Any]:
+    """A peer with the number of processes at which it is quickest, and those."""
+    from gymnasium.vector import AsyncVectorEnv  # pyright: ignore[reportMissingImports]
+
+    steps = max(5, options.work // MIDDLE)
+
+    def walk(n: int) -> tuple[Any, Callable[[], None]]:
+        envs = AsyncVectorEnv([lambda: make_gymnasium(module, task)] * n, context="forkserver")
         envs.reset(seed=0)
-        return envs, np.random.default_rng(0).uniform(-1.0, 1.0, (options.steps, *envs.action_space.shape))  # pyright: ignore
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, *envs.action_space.shape)).astype(np.float32)  # pyright: ignore
 
-    def take(envs: Any, actions: np.ndarray) -> None:
-        for action in actions.astype(np.float32):
-            envs.step(action)
+        def take() -> None:
+            for action in actions:
+                envs.step(action)
+
+        return envs, take
 
     speeds = {}
     for n in options.peer_envs:
-        envs, actions = walk(n)
-        take(envs, actions)
+        envs, take = walk(n)
+        take()
         begun = time.perf_counter()
-        take(envs, actions)
-        speeds[n] = n * options.steps / (time.perf_counter() - begun)
+        take()
+        speeds[n] = n / (time.perf_counter() - begun)
         envs.close()
     best = max(speeds, key=lambda n: speeds[n])
-    envs, actions = walk(best)
-    env, ours_actions, start = prepare("ant", options, maps=True)
-    run = rollouts(env, ours_actions)
-    ours, theirs = time_pairs(lambda: run(start), lambda: take(envs, actions))
-    envs.close()
-    mine, peer = options.envs * options.steps, best * options.steps
-    results.add(
-        f"ant, {options.envs} environments, with maps", "steps/s", [mine / t for t in ours],
-        against=f"Gymnasium-Robotics {options.peer}, {best} processes",
-        ratios=[(mine / a) / (peer / b) for a, b in zip(ours, theirs, strict=True)],
-    )  # fmt: skip
-    results.add(f"Gymnasium-Robotics {options.peer}, {best} processes", "steps/s", [peer / t for t in theirs])
+    envs, take = walk(best)
+    return Contestant(take, steps * best), envs
+
+
+def brax_ant(backend: str, ready: Prepared) -> Contestant:
+    """brax's own ant with as many environments, and the steps that take as long as they may."""
+    from brax.envs import get_environment
+
+    env = get_environment("ant", backend=backend)
+    steps, n, _ = ready.actions.shape
+    if jax.default_backend() == "cpu":
+        steps = max(1, steps // 50)
+    start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), n))
+    step = jax.vmap(env.step)
+
+    @jax.jit
+    def run(state: Any, actions: jax.Array) -> Any:
+        def once(state: Any, action: jax.Array) -> tuple[Any, None]:
+            return step(state, action), None
+
+        return jax.lax.scan(once, state, actions)[0].reward
+
+    return Contestant(lambda: run(start, ready.actions[:steps]), steps * n)
+
+
+def collection(robot: str, options: RolloutOptions, results: Results) -> None:
+    """The rows of planner-guided trajectories."""
+    settings = get_preset("cpu", robot)
+    controller, _ = load_controller("zoo", robot)
+    env = MazeEnv(robot, maps=False, auto_reset=False, horizon=settings.collect.horizon)
+    mazes = stack_mazes([load_maze(MAZE)])
+    for guide in ("roadmap", "shortcut", "explorer"):
+        size = max(1, round(1.25 * options.trajectories))
+        config = replace(settings.collect, trajectories=options.trajectories, envs=size, guide=guide)
+
+        def run(config=config) -> object:
+            return jnp.asarray(collect(jax.random.key(0), env, mazes, controller, config, settings.prm).length)
+
+        name = f"{robot}, collection guided by {guide}"
+        results.race(name, "trajectories/s", Contestant(run, options.trajectories), repeat=min(2, options.repeat))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    main(tyro.cli(RolloutOptions, description=about(__doc__)))

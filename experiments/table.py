@@ -148,13 +148,14 @@ def pooled(rows: list[dict[str, Any]], name: str) -> str:
 
 
 def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
-    """One line a figure."""
-    lines = ["| what | median (min-max) | against | ratio (min-max) |", "|---|---|---|---|"]
-    for row in rows:
+    """One line a figure of which something is asked, if there are such; all are in the benchmark's docstring."""
+    lines = ["| what | median (min-max) | against | times (min-max) | asked |", "|---|---|---|---|---|"]
+    for row in [row for row in rows if row.get("asked")] or rows:
         ratio = row["ratio"]
         shown = f"{ratio['median']:.2f} ({ratio['min']:.2f}-{ratio['max']:.2f})" if ratio else ""
         figures = f"{row['value']:,.4g} ({row['min']:,.4g}-{row['max']:,.4g}) {row['unit']}"
-        lines.append(f"| {row['name']} | {figures} | {row['against']} | {shown} |")
+        asked = f"{row['asked']:.3g}" if row.get("asked") else ""
+        lines.append(f"| {row['name']} | {figures} | {row['against']} | {shown} | {asked} |")
     made = rows[0]["made"]
     name = f"`{made['command']}`; commit {made['commit']}; {made['hardware']}; {made['created'][:10]}."
     return [*lines, "", name]

@@ -1,0 +1,239 @@
+"""The low-level controller's learner: gradient updates/s, and the time until it walks 90 % of unseen edges.
+
+    python benchmarks/sac.py [--full]
+
+The peer is Stable-Baselines3's SAC (torch) on the same environments: ours, compiled and vectorised, behind its
+``VecEnv``, with the same networks, batch, rewards and normalised inputs, at one update a step of one environment and at
+our setting (64 environments, 8 updates a step). Both are timed with all they do besides: stepping, storing, drawing.
+An episode that times out ends for the peer as one that fails: ours go on by themselves, and their last observation is
+not kept. With --full the peer, too, learns until it walks 90 % of the edges.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from _harness import Contestant, Options, Results, about, has_peer
+from flax import struct
+
+from ct_envs import MazeEnv, Tasks, load_maze
+from ct_envs.maze import Maze
+from ct_jax.controllers.sac import Sac, SacConfig, SacController, edge_success, split_edges
+from ct_jax.prm import build_roadmap
+
+PEER = "Stable-Baselines3"
+
+
+@dataclass(frozen=True)
+class SacOptions(Options):
+    """Sizes of the benchmark."""
+
+    robots: tuple[str, ...] = ("point", "ant")
+    """Robots whose updates are counted."""
+    updates: int = 128
+    """Updates a call."""
+    learner: str = "point"
+    """Robot that learns to walk edges."""
+    walks: float = 0.9
+    """Share of the held-out edges that it has to walk."""
+    limit_s: float = 1200.0
+    """Training time after which it is given up."""
+
+
+def main(options: SacOptions) -> None:
+    """Run and print."""
+    results = Results(__file__, options)
+    peer = has_peer("stable_baselines3", PEER)
+    for robot in options.robots:
+        for envs, updates, asked in ((1, 1, 2.5), (64, 8, 5.0)):
+            count(robot, SacConfig(envs=envs, updates=updates), peer, asked, options, results)
+    learn(peer and options.full, options, results)
+    results.finish()
+
+
+def count(robot: str, config: SacConfig, peer: bool, asked: float, options: SacOptions, results: Results) -> None:
+    """The row of a robot's updates."""
+    iterations = max(1, options.updates // config.updates)
+    work = float(iterations * config.updates)
+    ours = Learner(robot, config)
+    others = {}
+    if peer:
+        theirs = PeerLearner(ours)
+        others = {PEER: Contestant(lambda: theirs.train(iterations), work)}
+    name = f"{robot}, {config.envs} environments, {config.updates} updates a step"
+    results.race(name, "updates/s", Contestant(lambda: ours.train(iterations), work), others, asked={PEER: asked})
+
+
+def learn(peer: bool, options: SacOptions, results: Results) -> None:
+    """The row of the time until edges are walked."""
+    name = f"{options.learner}: until {100 * options.walks:.0f} % of the edges are walked"
+    ours = Learner(options.learner, SacConfig())
+    reached = time_to(options, ours.train, lambda: ours.success(ours.controller))
+    if not peer:
+        results.add(name, "s", [reached])
+        return
+    theirs = PeerLearner(ours)
+    other = time_to(options, theirs.train, lambda: ours.success(theirs.controller))
+    results.add(name, "s", [reached], against=PEER, other=[other], ratios=[other / reached])
+
+
+def time_to(
+    options: SacOptions, train: Callable[[int], Any], success: Callable[[], float], *, chunk: int = 25
+) -> float:
+    """Seconds of training until the success is high enough; looking does not count, nor does the first chunk's
+    compilation. Infinite where the limit comes first."""
+    train(chunk)  # compiles; what it learns is not taken off, to either side
+    spent = 0.0
+    while success() < options.walks:
+        if spent > options.limit_s:
+            return float("inf")
+        begun = time.perf_counter()
+        train(chunk)
+        spent += time.perf_counter() - begun
+    return spent
+
+
+class Learner:
+    """Ours, on the edges of a roadmap of ``antmaze-large``."""
+
+    def __init__(self, robot: str, config: SacConfig):
+        self.maze = load_maze("antmaze-large")
+        options = {"horizon": config.episode_steps, "maps": False}
+        self.env = MazeEnv(robot, engine="auto", reset_velocity_mps=config.reset_velocity_mps, **options)
+        self._still = MazeEnv(robot, engine="auto", auto_reset=False, **options)
+        roadmap = build_roadmap(jax.random.key(0), self.maze, radius_m=self.env.robot.radius_m)
+        self.tasks, self._held_out = split_edges(roadmap, config.held_out, 0)
+        self.sac = Sac(self.env, config)
+        self.state, _ = self.sac.train(self.sac.create(jax.random.key(0), self.maze, self.tasks), config.warmup)
+
+    def train(self, iterations: int) -> Any:
+        """Go on."""
+        self.state, report = self.sac.train(self.state, iterations)
+        return jax.block_until_ready(report)
+
+    @property
+    def controller(self) -> SacController:
+        """What is learned so far."""
+        config, state = self.sac.config, self.state
+        return SacController(
+            state.normalizer, state.average, self.env.action_size, config.hidden, config.frame, config.effort
+        )
+
+    def success(self, controller: Any) -> float:
+        """Share of the held-out edges that a controller walks."""
+        return edge_success(self._still, controller, self.maze, self._held_out, jax.random.key(1))
+
+
+@struct.dataclass
+class PeerController:
+    """The peer's policy as one of ours."""
+
+    mean: jax.Array
+    deviation: jax.Array
+    layers: tuple[tuple[jax.Array, jax.Array], ...]
+    action_size: int = struct.field(pytree_node=False)
+
+    def __call__(self, proprio: jax.Array, goal: jax.Array) -> jax.Array:
+        seen = jnp.concatenate([proprio, goal], -1)
+        x = jnp.clip((seen - self.mean[None]) / self.deviation[None], -10.0, 10.0)
+        for weight, bias in self.layers[:-1]:
+            x = jax.nn.relu(x @ weight.T + bias[None])
+        weight, bias = self.layers[-1]
+        return jnp.tanh(x @ weight.T + bias[None])
+
+
+class PeerLearner:
+    """Stable-Baselines3's, on the same tasks with the same settings."""
+
+    def __init__(self, ours: Learner):
+        import torch  # pyright: ignore[reportMissingImports]
+        from stable_baselines3 import SAC  # pyright: ignore[reportMissingImports]
+        from stable_baselines3.common.vec_env import VecNormalize  # pyright: ignore[reportMissingImports]
+
+        config, size = ours.sac.config, ours.env.action_size
+        self._envs, self._action_size = config.envs, size
+        self._normal = VecNormalize(vec_env(ours.sac, ours.maze, ours.tasks), norm_reward=False)
+        torch.manual_seed(0)
+        self._sac = SAC(
+            "MlpPolicy", self._normal, learning_rate=config.learning_rate, buffer_size=config.replay,
+            learning_starts=config.warmup * config.envs, batch_size=config.batch, tau=config.target_rate,
+            gamma=config.discount, train_freq=(1, "step"), gradient_steps=config.updates,
+            ent_coef=f"auto_{config.initial_temperature}", target_entropy=-0.5 * size,
+            policy_kwargs={"net_arch": list(config.hidden)},
+        )  # fmt: skip
+        self.train(config.warmup + 1)
+
+    def train(self, iterations: int) -> None:
+        """Go on."""
+        self._sac.learn(iterations * self._envs, reset_num_timesteps=False)
+
+    @property
+    def controller(self) -> PeerController:
+        """What is learned so far."""
+        actor, seen = self._sac.policy.actor, self._normal.obs_rms
+        linear = [layer for layer in actor.latent_pi if hasattr(layer, "weight")] + [actor.mu]
+        layers = tuple(
+            tuple(jnp.asarray(leaf.detach().cpu().numpy()) for leaf in (layer.weight, layer.bias)) for layer in linear
+        )
+        deviation = jnp.asarray(np.sqrt(seen.var + self._normal.epsilon), jnp.float32)
+        return PeerController(jnp.asarray(seen.mean, jnp.float32), deviation, layers, self._action_size)  # pyright: ignore
+
+
+def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
+    """A learner's environments, with its observations and rewards, as the peer's ``VecEnv``."""
+    from gymnasium.spaces import Box  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
+
+    env, n = sac.env, sac.config.envs
+
+    @jax.jit
+    def step(state: Any, action: jax.Array) -> tuple[Any, ...]:
+        after = jax.vmap(env.step)(state, sac.config.effort * action)
+        return after, sac._observe(after), sac._reward(state, after), after.done
+
+    class Environments(VecEnv):
+        """All of them, stepped by one compiled call."""
+
+        def __init__(self) -> None:
+            size = env.proprio_size + sac.kept
+            seen = Box(-np.inf, np.inf, (size,), np.float32)
+            super().__init__(n, seen, Box(-1.0, 1.0, (env.action_size,), np.float32))
+            reset = jax.vmap(env.reset, in_axes=(0, None, None))
+            self._state = jax.jit(reset)(jax.random.split(jax.random.key(0), n), maze, tasks)
+
+        def reset(self) -> np.ndarray:
+            return np.asarray(sac._observe(self._state))
+
+        def step_async(self, actions: np.ndarray) -> None:
+            before = self._observed if hasattr(self, "_observed") else self.reset()
+            self._state, observed, reward, done = step(self._state, jnp.asarray(actions))
+            self._observed, over = np.asarray(observed), np.asarray(done) > 0
+            infos = [{"terminal_observation": before[i]} if over[i] else {} for i in range(n)]
+            self._answer = self._observed, np.asarray(reward), over, infos
+
+        def step_wait(self) -> tuple[Any, ...]:
+            return self._answer
+
+        def close(self) -> None: ...
+
+        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+            return [None] * n
+
+        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
+
+        def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+            return [None] * n
+
+        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+            return [False] * n
+
+    return Environments()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(SacOptions, description=about(__doc__)))

@@ -1,0 +1,137 @@
+"""Training steps/s of the Control Transformer with its map encoder, at the paper's two sizes.
+
+    python benchmarks/transformer.py [--full]
+
+*turtlebot3* is 4 layers of 128, K=5, batch 128; *ant* is 4 layers of 512, K=50, batch 64 (paper, table II). Ours is the
+step as it is trained with, in a ``scan``: windows drawn from trajectories, their maps recomputed, gradient, clipping,
+AdamW. The peer is Hugging Face's Decision Transformer in torch (same widths, batch, and a CNN as ours in front), on one
+batch that lies ready. The third contestant is a matrix product: the ratio is the share of its FLOP/s that our step
+reaches, counting XLA's count for one gradient of the loss without the drawing of windows.
+On a GPU the same in bfloat16 and with cuDNN's attention.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from _harness import Contestant, Options, Results, about, has_peer
+
+from ct_envs import load_maze, stack_mazes
+from ct_envs.robots import get_robot
+from ct_jax.fit import Fit, init_params, transformer_loss
+from ct_jax.model import sizes
+from ct_jax.presets import get_preset
+from ct_jax.trajectories import Trajectories, Window, sample_windows
+from ct_jax.transformer import ControlTransformer
+
+PEER = "Hugging Face, torch"
+TRAJECTORIES, STEPS = 256, 256
+
+
+@dataclass(frozen=True)
+class TransformerOptions(Options):
+    """Sizes of the benchmark."""
+
+    robots: tuple[str, ...] = ("turtlebot3", "ant")
+    """Whose paper-size models."""
+    side: int = 2048
+    """Of the matrices (4 times that on an accelerator)."""
+    gflop: float = 100.0
+    """Work of a call, at least (100 times that on an accelerator)."""
+    preset: str = "paper"
+    """Of the models."""
+
+
+def main(options: TransformerOptions) -> None:
+    """Run and print."""
+    results = Results(__file__, options)
+    torch = has_peer("torch", PEER) and has_peer("transformers", PEER)
+    for robot in options.robots:
+        measure(robot, "float32", "xla", torch, options, results)
+        if jax.default_backend() == "gpu":
+            # cuDNN wants even numbers of tokens
+            for attention in ("xla", "cudnn") if robot == "ant" else ("xla",):
+                measure(robot, "bfloat16", attention, torch, options, results)
+    results.finish()
+
+
+def measure(robot: str, dtype: str, attention: str, torch: bool, options: TransformerOptions, results: Results) -> None:
+    """The rows of one model."""
+    settings = get_preset(options.preset, robot)
+    fit, map_cell_m, spec = settings.fit, settings.model.map_cell_m, get_robot(robot)
+    model = ControlTransformer(settings.model, sizes(robot)[1], dtype=jnp.dtype(dtype), attention=attention)
+    data = trajectories(robot)
+    mazes = stack_mazes([load_maze("antmaze-large")]) if data.map_bits is None else None
+    learner = Fit(transformer_loss(model), fit, map_cell_m, spec)
+    state = learner.create(jax.random.key(0), init_params(jax.random.key(1), model, data))
+    draw = jax.jit(lambda key: sample_windows(
+        key, data, data.rtg, mazes, batch=fit.batch, steps=fit.steps, map_cell_m=map_cell_m))  # fmt: skip
+    window = draw(jax.random.key(2))
+    # of plain attention in any case: what cuDNN does inside is not counted
+    plain = ControlTransformer(settings.model, model.action_size)
+    step_flop = flop(plain, state.params, window)
+    accelerator = jax.default_backend() != "cpu"
+    updates = max(1, int((100 if accelerator else 1) * options.gflop * 1e9 / step_flop))
+    ours = Contestant(lambda: learner.train(state, data, data.rtg, mazes, updates), updates)
+    product = f"{dtype} matrix product"
+    others = {product: matrix_product(options.side * (4 if accelerator else 1), dtype, step_flop)}
+    if torch:
+        others[PEER] = peer(settings.model, window, updates, bf16=dtype == "bfloat16")
+    asked = {PEER: 1.2} if not accelerator else {product: 0.4} if dtype == "bfloat16" and robot == "ant" else {}
+    name = f"{robot}, {dtype}" + (", cuDNN attention" if attention == "cudnn" else "")
+    few = None if accelerator or options.full else min(3, options.repeat)
+    times = results.race(name, "steps/s", ours, others, asked=asked, repeat=few)
+    results.add(name, "GFLOP/s", [updates * step_flop / 1e9 / t for t in times])
+
+
+def trajectories(robot: str) -> Trajectories:
+    """Random trajectories of the robot's sizes; a robot that drives in rooms keeps its maps."""
+    rng = np.random.default_rng(0)
+    proprio, action = sizes(robot)
+    shape = (TRAJECTORIES, STEPS)
+    normal = lambda *more: rng.normal(size=(*shape, *more)).astype(np.float32)  # noqa: E731
+    seen = {}
+    if get_robot(robot).course == "room":
+        seen = {"seen": normal(2), "map_bits": rng.integers(0, 256, (*shape, 157), dtype=np.uint8)}
+    return jax.tree.map(
+        jnp.asarray,
+        Trajectories(
+            position=rng.uniform(4.0, 30.0, (*shape, 2)).astype(np.float32), proprio=normal(proprio),
+            action=np.tanh(normal(action)), target=np.tanh(normal(action)), reward=-np.abs(normal()),
+            learn=np.ones(shape, np.float32), collision=np.zeros(shape, np.float32),
+            goal=rng.uniform(4.0, 30.0, (TRAJECTORIES, 2)).astype(np.float32),
+            maze=np.zeros(TRAJECTORIES, np.int32), length=np.full(TRAJECTORIES, STEPS, np.int32), **seen,
+        ),
+    )  # fmt: skip
+
+
+def flop(model: ControlTransformer, params: Any, window: Window) -> float:
+    """Floating-point operations of one gradient of the loss, as XLA counts them."""
+    gradient = jax.jit(jax.grad(transformer_loss(model)))
+    return float(gradient.lower(params, window, jax.random.key(0)).cost_analysis()["flops"])  # pyright: ignore
+
+
+def matrix_product(side: int, dtype: str, step_flop: float) -> Contestant:
+    """Square matrices multiplied, counted in training steps."""
+    a = jax.random.normal(jax.random.key(0), (side, side), jnp.dtype(dtype))
+    multiply = jax.jit(lambda a: jax.lax.fori_loop(0, 4, lambda _, b: (a @ b) / side**0.5, a))
+    return Contestant(lambda: multiply(a), 4 * 2.0 * side**3 / step_flop)
+
+
+def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant:
+    """The peer's training on such a window."""
+    from _decision_transformer import PeerTraining, PeerTransformer, batch_of
+
+    names = ("map", "proprio", "goal", "action", "target", "rtg", "timestep", "valid")
+    batch = batch_of(**{name: np.asarray(getattr(window, name)) for name in names})
+    batch["timestep"] = batch["timestep"].long()
+    sizes = (window.proprio.shape[-1], window.action.shape[-1], window.rtg.shape[1])
+    training = PeerTraining(PeerTransformer(config, *sizes), batch, bf16=bf16)
+    return Contestant(lambda: training.train(updates), updates)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(TransformerOptions, description=about(__doc__)))

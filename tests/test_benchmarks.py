@@ -1,0 +1,119 @@
+"""The benchmarks' harness: contestants in turn, ratios pair by pair, a table made of nothing but the results."""
+
+import ast
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import _harness
+import prm as prm_benchmark
+from _harness import LAST, Contestant, Options, Results, about, has_peer, table_of, time_together, with_table
+
+from ct_envs import load_maze
+
+BENCHMARKS = Path(_harness.__file__).parent
+SOURCE = '"""What it does.\n\n    python it.py\n"""\n\nimport this\n\nX = """not a docstring"""\n'
+
+
+class Clock:
+    """Time that passes only where a contestant says so."""
+
+    def __init__(self, monkeypatch):
+        self.now, self.order = 0.0, []
+        monkeypatch.setattr(_harness.time, "perf_counter", lambda: self.now)
+
+    def contestant(self, name: str, *seconds: float, work: float = 1.0) -> Contestant:
+        spent = itertools.cycle(seconds)
+
+        def run() -> None:
+            self.order.append(name)
+            self.now += next(spent)
+
+        return Contestant(run, work)
+
+
+def results(tmp_path, monkeypatch, **options) -> Results:
+    monkeypatch.setattr(_harness, "RESULTS", tmp_path / "results")
+    (tmp_path / "it.py").write_text(SOURCE)
+    return Results(str(tmp_path / "it.py"), Options(**options))
+
+
+def test_contestants_take_turns_after_a_warm_up(monkeypatch):
+    clock = Clock(monkeypatch)
+    a, b = clock.contestant("a", 9.0, 1.0, 3.0), clock.contestant("b", 9.0, 2.0, 4.0)
+    assert time_together(a.run, b.run, repeat=2) == [[1.0, 3.0], [2.0, 4.0]]
+    assert clock.order == ["a", "b"] * 3
+
+
+@pytest.mark.parametrize(("unit", "value", "other"), [("steps/s", 4.0, 1.0), ("ms", 250.0, 1000.0)])
+def test_a_ratio_says_how_many_times_as_fast_ours_is(tmp_path, monkeypatch, unit, value, other):
+    """Whatever is counted: for each unit of work, pair by pair."""
+    clock = Clock(monkeypatch)
+    race = results(tmp_path, monkeypatch, repeat=3)
+    ours, rival = clock.contestant("a", 1.0, 2.0, 1.0, 1.0, work=4.0), clock.contestant("b", 2.0, work=2.0)
+    race.race("walk", unit, ours, {"rival": rival}, asked={"rival": 3.0})
+    (row,) = race._rows
+    assert (row["value"], row["other"], row["against"], row["asked"]) == (value, other, "rival", 3.0)
+    assert row["ratio"] == {"median": 4.0, "min": 2.0, "max": 4.0}
+
+
+def test_the_docstring_holds_the_table_of_the_results(tmp_path, monkeypatch):
+    """However often it is written, and the rest of the file stays as it is."""
+    for times in (1, 2):
+        race = results(tmp_path, monkeypatch) if times == 1 else Results(str(tmp_path / "it.py"), Options())
+        race.add("a step of a name that is long " * 3, "ms", [times * 1234.5], against="x", ratios=[2.0], asked=1.5)
+        race.finish()
+        rows = json.loads((tmp_path / "results/it.json").read_text())
+        assert {"name", "value", "unit", "against", "ratio", "made"} <= set(rows[0])
+        source = (tmp_path / "it.py").read_text()
+        docstring = ast.get_docstring(ast.parse(source), clean=False)
+        assert docstring == about(docstring).rstrip() + LAST + table_of(rows) + "\n"
+        assert f"{1234.5 * times:,.0f}" in docstring and all(len(line) <= 120 for line in docstring.splitlines())
+        assert source.startswith(SOURCE.split("\n\n    python")[0]) and source.endswith(SOURCE.split('"""\n\n', 1)[1])
+    assert about(docstring) == "What it does.\n\n    python it.py"
+
+
+def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
+    race = results(tmp_path, monkeypatch, write=False)
+    race.add("a", "ms", [1.0])
+    race.finish()
+    assert (tmp_path / "it.py").read_text() == SOURCE and not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("file", sorted(BENCHMARKS.glob("[a-z]*.py")), ids=lambda file: file.stem)
+def test_no_table_was_typed_by_hand(file):
+    text = file.read_text()
+    assert f"python benchmarks/{file.name}" in about(ast.get_docstring(ast.parse(text)))
+    if LAST in text:
+        assert with_table(text, table_of(json.loads((BENCHMARKS / f"results/{file.stem}.json").read_text()))) == text
+
+
+def test_a_missing_peer_is_said(capsys):
+    assert has_peer("json", "JSON") and not has_peer("no_such_peer", "Nobody")
+    assert capsys.readouterr().out == "Nobody is not installed, so it is not measured: pip install -e '.[bench]'\n"
+
+
+def test_the_python_loop_builds_the_same_roadmap():
+    maze = load_maze("antmaze-large")
+    roadmap = prm_benchmark.building(maze, 60)()
+    walls = np.asarray(maze.walls).tolist()
+    graph = prm_benchmark.loop_roadmap(roadmap.points.tolist(), walls, 4.0, roadmap.config.connect_m)
+    assert {tuple(sorted(edge)) for edge in graph.edges} == set(map(tuple, roadmap.edges.tolist()))
+    table = prm_benchmark.loop_table(graph)
+    expected, distance = np.asarray(roadmap.table.next_hop), np.asarray(roadmap.table.distance)
+    for goal, hops in table.items():
+        for node, hop in hops.items():  # as short, if not the same: two ways may be
+            assert hop == expected[node, goal] or np.isclose(
+                distance[node, hop] + distance[hop, goal], distance[node, goal], rtol=1e-5
+            )
+    plan = roadmap.plan(*(ends := prm_benchmark.building(maze, 8)().points[:2]))
+    path = prm_benchmark.loop_plan(graph, roadmap.points.tolist(), walls, 4.0, roadmap.config.connect_m, *ends)
+    np.testing.assert_array_equal(roadmap.points[path[1:-1]], plan.points[1:-1])
+    assert jax.tree.leaves(table) and "start" not in graph
