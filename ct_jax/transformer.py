@@ -5,17 +5,21 @@ come before it. That is what acting with a key/value cache over a sliding window
 mask, so a window of any number of steps may be trained on.
 """
 
+import functools
 from dataclasses import dataclass
+from typing import Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ct_envs.frames import own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
 
+Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
 TOKENS = 3  # of a step: return-to-go, state, action
 GOAL_SCALE_M = 10.0  # goal vectors are divided by this
 RETURN_SCALE = 1000.0  # returns are divided by this
@@ -65,17 +69,18 @@ class MapEncoder(nn.Module):
 
     width: int
     patch: int = 5
+    dtype: DTypeLike | None = None  # of the computations
 
     @nn.compact
     def __call__(self, maps: UInt8[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
-        maps = maps.astype(jnp.float32)
+        maps, dense = maps.astype(self.dtype or jnp.float32), functools.partial(nn.Dense, dtype=self.dtype)
         lead, n, p = maps.shape[:-3], maps.shape[-1] // self.patch, self.patch
         x = maps.reshape(*lead, 2, n, p, n, p)
         x = jnp.moveaxis(x, (-5, -3, -1), (-3, -2, -1)).reshape(*lead, n, n, 2 * p * p)
-        x = nn.relu(nn.Dense(32, name="conv5")(x))
+        x = nn.relu(dense(32, name="conv5")(x))
         rows = [x[..., i : n - 2 + i, j : n - 2 + j, :] for i in range(3) for j in range(3)]
-        x = nn.relu(nn.Dense(64, name="conv3")(jnp.concatenate(rows, -1)))
-        return nn.Dense(self.width, name="out")(x.reshape(*lead, -1))
+        x = nn.relu(dense(64, name="conv3")(jnp.concatenate(rows, -1)))
+        return dense(self.width, name="out")(x.reshape(*lead, -1))
 
 
 def goal_features(goal: Float[Array, "*b 2"]) -> Float[Array, "*b 6"]:
@@ -88,13 +93,15 @@ class Block(nn.Module):
     """Pre-norm attention and MLP with ReLU (paper, table II)."""
 
     config: ModelConfig
+    dtype: DTypeLike | None = None
+    attention: Attention | None = None
 
     def setup(self) -> None:
-        width = self.config.width
-        self.norm_attention, self.norm_mlp = nn.LayerNorm(), nn.LayerNorm()
-        self.qkv = nn.Dense(3 * width)
-        self.project = nn.Dense(width)
-        self.up, self.down = nn.Dense(4 * width), nn.Dense(width)
+        width, dense = self.config.width, functools.partial(nn.Dense, dtype=self.dtype)
+        self.norm_attention, self.norm_mlp = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
+        self.qkv = dense(3 * width)
+        self.project = dense(width)
+        self.up, self.down = dense(4 * width), dense(width)
         self.dropout = nn.Dropout(self.config.dropout)
 
     def heads(self, x: Float[Array, "B T W"]) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -105,7 +112,7 @@ class Block(nn.Module):
     def attend(
         self, x: jax.Array, q: jax.Array, k: jax.Array, v: jax.Array, mask: Bool[Array, "B T M"], deterministic: bool
     ) -> jax.Array:
-        mixed = jax.nn.dot_product_attention(q, k, v, mask=mask[:, None])
+        mixed = jax.nn.dot_product_attention(q, k, v, mask=mask[:, None], implementation=self.attention)
         x = x + self.dropout(self.project(mixed.reshape(x.shape)), deterministic=deterministic)
         hidden = self.down(nn.relu(self.up(self.norm_mlp(x))))
         return x + self.dropout(hidden, deterministic=deterministic)
@@ -145,22 +152,30 @@ class HeadingHead(nn.Module):
 
 
 class ControlTransformer(nn.Module):
-    """pi_theta(a_t | R_{t-K+1..t}, s_{t-K+1..t}, a_{t-K+1..t-1})."""
+    """pi_theta(a_t | R_{t-K+1..t}, s_{t-K+1..t}, a_{t-K+1..t-1}).
+
+    ``dtype`` is that of the computations, for training on accelerators in bfloat16; parameters and actions are float32 in
+    any case, and acting with a cache is for a model without it. ``attention`` is which of jax's implementations is used.
+    """
 
     config: ModelConfig
     action_size: int
+    dtype: DTypeLike | None = None
+    attention: Attention | None = None
 
     def setup(self) -> None:
-        c = self.config
-        self.encode_map = MapEncoder(c.width)
-        self.embed_goal = nn.Dense(c.width)
-        self.embed_state = nn.Dense(c.width)
-        self.embed_action = nn.Dense(c.width)
-        self.embed_return = nn.Dense(c.width)
-        self.embed_timestep = nn.Embed(c.max_timestep, c.width, embedding_init=nn.initializers.normal(0.02))
-        self.norm_in, self.norm_out = nn.LayerNorm(), nn.LayerNorm()
+        c, dense = self.config, functools.partial(nn.Dense, dtype=self.dtype)
+        self.encode_map = MapEncoder(c.width, dtype=self.dtype)
+        self.embed_goal = dense(c.width)
+        self.embed_state = dense(c.width)
+        self.embed_action = dense(c.width)
+        self.embed_return = dense(c.width)
+        self.embed_timestep = nn.Embed(
+            c.max_timestep, c.width, embedding_init=nn.initializers.normal(0.02), dtype=self.dtype
+        )
+        self.norm_in, self.norm_out = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
         self.dropout = nn.Dropout(c.dropout)
-        self.blocks = [Block(c) for _ in range(c.layers)]
+        self.blocks = [Block(c, self.dtype, self.attention) for _ in range(c.layers)]
         if c.frame == "heading":
             self.head = HeadingHead(c.directions, self.action_size)
         else:
@@ -183,7 +198,7 @@ class ControlTransformer(nn.Module):
 
     def _predict(self, x: jax.Array, proprio: jax.Array) -> jax.Array:
         """Actions from what the trunk makes of state tokens."""
-        x = self.norm_out(x)
+        x = self.norm_out(x).astype(jnp.float32)
         return self.head(x, proprio) if self.config.frame == "heading" else self.predict_action(x)
 
     def __call__(
