@@ -24,7 +24,7 @@ from ct_jax.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
 PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")
-LAST = "\n\nLast results, "
+LAST = "\n\nLast results:\n\n"
 _WIDTH = 116
 
 

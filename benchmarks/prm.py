@@ -172,13 +172,19 @@ def loop_plan(
     graph: nx.Graph, points: list[list[float]], walls: list[list[bool]], cell: float, reach: float,
     start: np.ndarray, goal: np.ndarray,
 ) -> list[Any]:  # fmt: skip
-    """A shortest path, start and goal joined to the roadmap for as long as it takes."""
+    """A shortest path, start and goal joined to the roadmap for as long as it takes; empty if there is none."""
+    graph.add_nodes_from(("start", "goal"))
+    others: list[tuple[Any, list[float]]] = list(enumerate(points))
     for name, end in (("start", start.tolist()), ("goal", goal.tolist())):
-        for i, point in enumerate(points):
+        for other, point in others:
             length = math.dist(end, point)
             if length <= reach and loop_free(end, point, walls, cell, RADIUS_M):
-                graph.add_edge(name, i, weight=length)
-    path = nx.shortest_path(graph, "start", "goal", weight="weight")
+                graph.add_edge(name, other, weight=length)
+        others.append((name, end))
+    try:
+        path = nx.shortest_path(graph, "start", "goal", weight="weight")
+    except nx.NetworkXNoPath:
+        path = []
     graph.remove_nodes_from(("start", "goal"))
     return path
 
