@@ -154,8 +154,8 @@ class HeadingHead(nn.Module):
 class ControlTransformer(nn.Module):
     """pi_theta(a_t | R_{t-K+1..t}, s_{t-K+1..t}, a_{t-K+1..t-1}).
 
-    ``dtype`` is that of the computations, for training on accelerators in bfloat16; parameters and actions are float32 in
-    any case, and acting with a cache is for a model without it. ``attention`` is which of jax's implementations is used.
+    ``dtype`` is that of the computations, for training on accelerators in bfloat16; parameters and actions stay
+    float32, and acting with a cache is for a model without it. ``attention`` names one of jax's implementations.
     """
 
     config: ModelConfig
