@@ -182,26 +182,31 @@ TURTLEBOT3_PAPER = Settings(
 )
 """The Turtlebot3 as published, table II: F-CT."""
 
+_TURTLEBOT3_LIFTED = replace(
+    TURTLEBOT3_PAPER.fit, updates=4000, learning_rate=1e-3, warmup=100, mirror=True, decay=True
+)
+
 TURTLEBOT3_CPU = replace(
     TURTLEBOT3_PAPER,
     prm=replace(TURTLEBOT3_PAPER.prm, margin_m=0.08),
     collect=replace(TURTLEBOT3_PAPER.collect, guide="shortcut", starts="maze", noise=0.3),
     model=replace(TURTLEBOT3_PAPER.model, dropout=0.0),
     value=ValueConfig(fit=replace(TURTLEBOT3_PAPER.value.fit, mirror=True)),
-    fit=replace(TURTLEBOT3_PAPER.fit, learning_rate=4e-4, warmup=500, mirror=True, decay=True),
+    fit=_TURTLEBOT3_LIFTED,
     recover=replace(TURTLEBOT3_PAPER.recover, keep="relabelled", takeover=0.01),
-    round_fit=replace(TURTLEBOT3_PAPER.fit, learning_rate=4e-4, warmup=500, mirror=True, decay=True),
+    round_fit=_TURTLEBOT3_LIFTED,
     reprompt=True,
 )
-"""What lifts it: ways with room to spare, free starts, disturbances, mirrored rooms, relabelled recoveries."""
+"""What lifts it: ways with room to spare, free starts, disturbances, mirrored rooms, relabelled recoveries; and with
+its rate raised and then lowered, training takes a quarter of the updates."""
 
 TURTLEBOT3_DEMO = replace(
     TURTLEBOT3_CPU,
     collect=replace(TURTLEBOT3_CPU.collect, trajectories=200),
     value=ValueConfig(fit=replace(TURTLEBOT3_CPU.value.fit, updates=800)),
-    fit=replace(TURTLEBOT3_CPU.fit, updates=1500, learning_rate=1e-3, warmup=100),
+    fit=replace(_TURTLEBOT3_LIFTED, updates=1500),
     recover=replace(TURTLEBOT3_CPU.recover, recoveries=100),
-    round_fit=replace(TURTLEBOT3_CPU.fit, updates=1500, learning_rate=1e-3, warmup=100),
+    round_fit=replace(_TURTLEBOT3_LIFTED, updates=1500),
     episodes=5,
     rooms=RoomConfig(worlds=10),
 )
