@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -132,7 +133,8 @@ class Checkpoints:
             except (ValueError, KeyError, OSError) as bad:
                 reason = " ".join(str(bad).split())[:200]
                 print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
-                folder.rename(folder.with_name(f"damaged-{step}-{time.time_ns()}"))
+                with suppress(FileNotFoundError):  # another process of the same training was quicker
+                    folder.rename(folder.with_name(f"damaged-{step}-{time.time_ns()}"))
                 self._manager.reload()
         return None
 
