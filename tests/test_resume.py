@@ -29,8 +29,8 @@ OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scan
 # -------------------------------------------------------------------------------------------------------- SIGKILL
 
 
-def live(arguments, settings, folder, operations, cache):
-    """One life of a run: to its end, or so many file operations in its folder."""
+def live(arguments, settings, folder, stage, operations, cache):
+    """One life of a run: to its end, or so many file operations after the first in a stage's folder."""
     from ct_envs import robots
     from ct_jax import checkpoint, cli, presets
 
@@ -40,21 +40,20 @@ def live(arguments, settings, folder, operations, cache):
     jax.config.update("jax_compilation_cache_dir", cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     checkpoint.SAVE_EVERY_S = 0.0
-    left = iter(range(operations - 1, -1, -1))
+    left = operations
 
     def watch(event, given):
-        if event in OPERATIONS and given and str(folder) in str(given[0]) and not next(left):
-            os.kill(os.getpid(), signal.SIGKILL)
+        nonlocal left
+        begun = left < operations
+        if event in OPERATIONS and given and str(folder if begun else folder / stage) in str(given[0]):
+            left -= 1
+            if not left:
+                os.kill(os.getpid(), signal.SIGKILL)
 
     if operations:
         sys.addaudithook(watch)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(cli.main([*arguments, "--out", str(folder), "--resume"]))
-
-
-def unfinished(folder):
-    """The stage in which a run was killed."""
-    return next((stage for stage in STAGES if not (folder / stage / "done.json").is_file()), "report")
 
 
 def weights(folder):
@@ -63,28 +62,35 @@ def weights(folder):
 
 
 class Killer:
-    """Runs a command again and again, and kills it so many times in all, every other time by the clock."""
+    """Runs a command to its end, over and over, and kills it on the way: each death is meant for a stage, and comes at
+    random within so many file operations there (an int), or so many seconds (a float)."""
 
-    def __init__(self, fork, arguments, settings, *, kills, operations, seconds=0.0, seed=0):
-        self.fork, self.arguments, self.settings, self.kills = fork, arguments, settings, kills
-        self.operations, self.seconds, self.rng = operations, seconds, np.random.default_rng(seed)
-        self.where = []
+    def __init__(self, fork, arguments, settings, deaths, *, seed=0):
+        self.fork, self.arguments, self.settings, self.deaths = fork, arguments, settings, list(deaths)
+        self.rng, self.died_in = np.random.default_rng(seed), []
 
-    def run(self, folder):
-        """To the end; as many deaths on the way as are left."""
+    def run(self, folder, stages=STAGES):
+        """To the end of all stages; as many deaths on the way as are left."""
         while True:
-            dying = len(self.where) < self.kills
-            by_clock = dying and self.seconds > 0 and len(self.where) % 2 == 1
-            operations = int(self.rng.integers(1, self.operations)) if dying and not by_clock else 0
+            now = next((stage for stage in stages if not (folder / stage / "done.json").is_file()), stages[-1])
+            stage, most = self.deaths[0] if self.deaths else (now, 0)
+            stage = max(stage, now, key=stages.index)  # by the clock it may have died too late
+            operations = int(self.rng.integers(1, most + 1)) if isinstance(most, int) and most else 0
             cache = jax.config.jax_compilation_cache_dir
-            process = self.fork(live, self.arguments, self.settings, folder, operations, cache)
-            process.join(self.rng.uniform(0.0, self.seconds) if by_clock else None)
+            process = self.fork(live, self.arguments, self.settings, folder, stage, operations, cache)
+            if isinstance(most, float):
+                while process.is_alive() and not (folder / stage).exists():
+                    time.sleep(0.02)
+                process.join(self.rng.uniform(0.0, most))
+            else:
+                process.join()
             process.kill()
             process.join()
             if process.exitcode == 0:
                 return
             assert process.exitcode == -signal.SIGKILL
-            self.where.append(unfinished(folder))
+            self.deaths.pop(0)
+            self.died_in.append(next((s for s in stages if not (folder / s / "done.json").is_file()), "report"))
 
 
 def assert_same_end(folder, whole):
@@ -95,34 +101,33 @@ def assert_same_end(folder, whole):
 
 
 def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, tmp_path):
-    killer = Killer(fork, tiny_run.arguments, tiny_settings, kills=3, operations=200, seed=1)
+    killer = Killer(fork, tiny_run.arguments, tiny_settings, [("controller", 60), ("collect", 4), ("finetune", 60)])
     killer.run(tmp_path / "run")
-    assert len(killer.where) == 3, killer.where
+    assert killer.died_in == ["controller", "collect", "finetune"]
     assert_same_end(tmp_path / "run", tiny_run.folder)
-
-
-def kill_often(killer, root, whole):
-    """As many whole runs as the deaths last; returns where it died."""
-    number = 0
-    while len(killer.where) < killer.kills:
-        number += 1
-        killer.run(root / str(number))
-        assert_same_end(root / str(number), whole)
-    return killer.where
 
 
 @pytest.mark.long
 def test_fourteen_deaths_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
     """Between two file operations, and by the clock: mostly while something is traced, compiled or computed."""
-    killer = Killer(fork, tiny_run.arguments, tiny_settings, kills=14, operations=200, seconds=20.0, seed=2)
-    where = kill_often(killer, tmp_path, tiny_run.folder)
-    assert {"controller", "collect", "fit", "finetune", "evaluate"} <= {*where}, where
+    deaths = [
+        ("prm", 4), ("controller", 60), ("controller", 3.0), ("controller", 60), ("collect", 4), ("collect", 3.0),
+        ("fit", 60), ("fit", 3.0), ("fit", 60), ("finetune", 60), ("finetune", 5.0), ("finetune", 60),
+        ("evaluate", 20), ("evaluate", 3.0),
+    ]  # fmt: skip
+    killer = Killer(fork, tiny_run.arguments, tiny_settings, deaths, seed=2)
+    for number in range(len(deaths)):
+        if killer.deaths:
+            killer.run(tmp_path / str(number))
+            assert_same_end(tmp_path / str(number), tiny_run.folder)
+    assert {*STAGES} <= {*killer.died_in} and not killer.deaths, killer.died_in
 
 
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="PyBullet is not installed")
 def test_six_deaths_in_rooms(fork, tmp_path):
     """With worker processes, which go when their pool is gone."""
+    stages = ("collect", "fit", "finetune", "evaluate")
     fit = FitConfig(updates=6, batch=4, steps=5, warmup=2)
     settings = replace(
         presets.TURTLEBOT3_CPU,
@@ -136,10 +141,12 @@ def test_six_deaths_in_rooms(fork, tmp_path):
         rooms=presets.RoomConfig(worlds=2),
     )
     arguments = ["train", "turtlebot3", "--preset", "tiny"]
-    Killer(fork, arguments, settings, kills=0, operations=0).run(tmp_path / "whole")
-    killer = Killer(fork, arguments, settings, kills=6, operations=150, seconds=30.0, seed=3)
-    where = kill_often(killer, tmp_path, tmp_path / "whole")
-    assert {"collect", "finetune"} <= {*where}, where
+    Killer(fork, arguments, settings, []).run(tmp_path / "whole", stages)
+    deaths = [("collect", 12), ("collect", 8.0), ("collect", 12), ("finetune", 8), ("finetune", 8.0), ("evaluate", 10)]
+    killer = Killer(fork, arguments, settings, deaths, seed=3)
+    killer.run(tmp_path / "killed", stages)
+    assert {"collect", "finetune", "evaluate"} <= {*killer.died_in}, killer.died_in
+    assert_same_end(tmp_path / "killed", tmp_path / "whole")
 
 
 # -------------------------------------------------------------------------------------------------------- SIGTERM
