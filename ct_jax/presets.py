@@ -142,7 +142,7 @@ def _for_ant(settings: Settings) -> Settings:
 
 
 def _for_humanoid(settings: Settings) -> Settings:
-    """Three of its control steps are one of the ant's, and it is as easily brought down."""
+    """Three of its control steps are one of the ant's, and it is brought down more easily."""
     settings = _for_walker(settings, _HUMANOID_SAC, horizon=1600, calm=0.1)
     recover = settings.recover
     recover = replace(

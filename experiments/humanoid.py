@@ -5,7 +5,7 @@
 
 With ``--preset cpu`` each row of the paper's table is trained at the CPU's size on 1000 guided trajectories: CT as
 published, BC-CT, F-CT, PT-CQL and SAC alone, and the preset with what lifts it; planner and explorer stand beside them.
-All of them meet the same 100 start-goal pairs. A controller of one's own takes a night on a free core and can be
+All of them meet the same 100 start-goal pairs. A controller of one's own takes hours of a core and can be
 interrupted at any time; ``--controller RUN`` takes that of a run. Writes ``experiments/results/humanoid-PRESET.json``.
 """
 
