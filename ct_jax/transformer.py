@@ -50,11 +50,12 @@ _NEVER = -(10**6)  # the step of a token that is not there
 class Cache:
     """Keys and values of the last steps of N episodes, a ring of K + 1 places for the tokens a_{t-1}, R_t, s_t.
 
-    One place more than K: the last action still sees K steps back from its own.
+    One place more than K: the last action still sees K steps back from its own. The places come last, as XLA's matrix
+    products on CPU want them: otherwise each step would transpose the whole cache.
     """
 
-    keys: tuple[Float[Array, "N P H D"], ...]  # one array a layer
-    values: tuple[Float[Array, "N P H D"], ...]
+    keys: tuple[Float[Array, "N H D P"], ...]  # one array a layer
+    values: tuple[Float[Array, "N H D P"], ...]
     step: Int[Array, "P"]  # step of each token
     now: Int[Array, ""]  # steps taken
     action: Float[Array, "N A"]  # last action
@@ -256,9 +257,9 @@ class ControlTransformer(nn.Module):
         keys, values = [], []
         for block, old_keys, old_values in zip(self.blocks, cache.keys, cache.values, strict=True):
             q, k, v = block.heads(x)
-            keys.append(jax.lax.dynamic_update_slice(old_keys, k, (0, place, 0, 0)))
-            values.append(jax.lax.dynamic_update_slice(old_values, v, (0, place, 0, 0)))
-            x = block.attend(x, q, keys[-1], values[-1], mask, True)
+            keys.append(jax.lax.dynamic_update_slice(old_keys, jnp.moveaxis(k, 1, -1), (0, 0, 0, place)))
+            values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
+            x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
         action = jnp.clip(self._predict(x[:, 2], proprio), -1.0, 1.0)
         return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
 
@@ -272,7 +273,7 @@ def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Arr
 def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
     """The cache before the first step of N episodes."""
     places = TOKENS * (config.context_acting + 1)
-    empty = jnp.zeros((n, places, config.heads, config.width // config.heads))
+    empty = jnp.zeros((n, config.heads, config.width // config.heads, places))
     return Cache(
         keys=(empty,) * config.layers,
         values=(empty,) * config.layers,
