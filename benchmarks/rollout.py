@@ -11,6 +11,7 @@ are run side by side, one process an environment, with as many as gives the most
 shipped controllers and the settings of the preset ``cpu``, roadmaps included.
 """
 
+import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -198,16 +199,10 @@ def measure_peers(options: RolloutOptions, results: Results) -> None:
 
 
 def make_gymnasium(module: str, task: str) -> Any:
-    """A peer's environment."""
+    """A peer's environment; runs in a process of its own."""
     import gymnasium  # pyright: ignore[reportMissingImports]
 
-    if module == "ogbench":
-        import ogbench  # pyright: ignore[reportMissingImports]
-
-        return ogbench.make_env_and_datasets(task, env_only=True)
-    import gymnasium_robotics  # pyright: ignore[reportMissingImports]
-
-    gymnasium.register_envs(gymnasium_robotics)
+    gymnasium.register_envs(importlib.import_module(module))
     return gymnasium.make(task)
 
 
