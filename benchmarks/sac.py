@@ -192,7 +192,7 @@ def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
     @jax.jit
     def step(state: Any, action: jax.Array) -> tuple[Any, ...]:
         after = jax.vmap(env.step)(state, sac.config.effort * action)
-        return after, sac._observe(after), sac._reward(state, after), after.done
+        return after, sac._observe(after), sac._reward(state, action, after), after.done
 
     class Environments(VecEnv):
         """All of them, stepped by one compiled call."""
