@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from ct_envs import Maze, MazeEnv, UserError, load_maze
+from ct_envs.maze import unpadded
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
@@ -169,5 +170,5 @@ def evaluate_in_maze(
         from ct_jax.report import pictures  # matplotlib, which takes its time
 
         reached = f"{int(outcome.success.sum())} of {len(outcome.success)} reached the goal"
-        pictures.write_paths(picture, np.asarray(world.walls), outcome, f"{model.robot}, {method} in {name}: {reached}")
+        pictures.write_paths(picture, unpadded(world), outcome, f"{model.robot}, {method} in {name}: {reached}")
     return row
