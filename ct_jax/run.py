@@ -328,7 +328,7 @@ def hardware() -> str:
     """The devices in words."""
     devices = jax.devices()
     accelerators = "" if devices[0].platform == "cpu" else f"{len(devices)} x {devices[0].device_kind}, "
-    return f"{accelerators}{platform.machine()} CPU, {cores()} cores"
+    return f"{accelerators}{platform.machine()} CPU, {cores()} core{'s' * (cores() > 1)}"
 
 
 def cores() -> int:
