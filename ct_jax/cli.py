@@ -82,11 +82,11 @@ class Evaluate:
       ct-jax evaluate runs/demo --maze my_floor.txt --episodes 20
       ct-jax evaluate runs/demo --method explorer --json > explorer.json
       ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
-      ct-jax evaluate runs/turtlebot3-cpu-0 --worlds 20 --pairs 25 --density 1.5 --noise 1
+      ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
-    """Run folder, or a model that ships with the package: zoo:point or zoo:ant."""
+    """Run folder, or a model that ships with the package: zoo:point, zoo:ant or zoo:turtlebot3."""
     maze: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: antmaze-large)")] = None
     """Maze by name or text file."""
     episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 100)")] = None
