@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
 INTERRUPTED = 130
+_stopped = False  # by a signal
 
 ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then cross mazes without one.
 
@@ -160,8 +161,26 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
         where = f"{bad.filename}: " if bad.filename else ""
         return _fail(f"{where}{bad.strerror or bad}; make room or choose another place, what is finished is kept")
     except KeyboardInterrupt as stop:
+        global _stopped
+        _stopped = True
         print(f"stopped; {go_on}", file=sys.stderr)
         return 0 if isinstance(stop, Terminated) else INTERRUPTED
+
+
+def leave(status: int) -> NoReturn:
+    """End the program. One that was interrupted ends at once: XLA may still compute something that calls Python, and
+    the two would wait for each other for ever."""
+    if not _stopped:
+        sys.exit(status)
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status)
+
+
+def entry() -> NoReturn:
+    """The program ``ct-jax``."""
+    leave(main())
 
 
 def _run(arguments: list[str]) -> None:
@@ -372,4 +391,4 @@ def print_rows(rows: list[Row]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    entry()

@@ -8,9 +8,9 @@ All of them meet the same 100 start-goal pairs. A controller of one's own is wha
 takes the shipped one. Writes ``experiments/results/ant-PRESET.json``.
 """
 
-import sys
-
 from _variants import experiment
 
+from ct_jax.cli import leave
+
 if __name__ == "__main__":
-    sys.exit(experiment("ant", __doc__))
+    leave(experiment("ant", __doc__))

@@ -9,9 +9,9 @@ All of them meet the same 100 start-goal pairs. A controller of one's own takes 
 interrupted at any time; ``--controller RUN`` takes that of a run. Writes ``experiments/results/humanoid-PRESET.json``.
 """
 
-import sys
-
 from _variants import experiment
 
+from ct_jax.cli import leave
+
 if __name__ == "__main__":
-    sys.exit(experiment("humanoid", __doc__))
+    leave(experiment("humanoid", __doc__))

@@ -8,9 +8,9 @@ planner and explorer stand beside them. All of them meet the same 100 start-goal
 ``experiments/results/point-PRESET.json``.
 """
 
-import sys
-
 from _variants import experiment
 
+from ct_jax.cli import leave
+
 if __name__ == "__main__":
-    sys.exit(experiment("point", __doc__))
+    leave(experiment("point", __doc__))

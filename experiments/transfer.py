@@ -9,7 +9,6 @@ transformer is fitted to all trajectories of a robot's run, from scratch or from
 """
 
 import functools
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from matplotlib.figure import Figure
 from ct_envs import MazeEnv, load_maze, stack_mazes
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
-from ct_jax.cli import guarded, prepare_jax
+from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import draw_pairs, evaluate
 from ct_jax.fit import Fit, fit, init_params, transformer_loss
 from ct_jax.model import TrainedModel, load_model
@@ -152,4 +151,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
+    leave(guarded(lambda: main(tyro.cli(Options, description=__doc__))))

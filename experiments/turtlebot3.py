@@ -187,4 +187,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from ct_jax.cli import leave
+
+    leave(main())
