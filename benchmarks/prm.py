@@ -105,7 +105,7 @@ def query(maze: Maze, samples: int, roadmap: Roadmap, planner: "OmplPlanner | No
 
 def growth(maze: Maze, options: PrmOptions, results: Results) -> None:
     """How the time for an edge grows with the roadmap."""
-    small, large = (s for s in (200, max(options.samples)))
+    small, large = 200, max(options.samples)
     builds = [building(maze, small), building(maze, large)]
     edges = [float(np.mean([len(build().edges) for _ in range(3)])) for build in builds]
     few, many = (Contestant(lambda b=build: b().edges, n) for build, n in zip(builds, edges, strict=True))

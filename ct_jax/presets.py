@@ -136,9 +136,8 @@ _HUMANOID_SAC = SacConfig(
 
 
 def _for_ant(settings: Settings) -> Settings:
-    """The ant is half as fast as the point: longer ways, rounds and memory."""
-    settings = _for_walker(settings, _ANT_SAC, horizon=700, calm=0.2)
-    return replace(settings, rounds=min(settings.rounds, 6))
+    """The ant is half as fast as the point: longer ways."""
+    return _for_walker(settings, _ANT_SAC, horizon=700, calm=0.2)
 
 
 def _for_humanoid(settings: Settings) -> Settings:
@@ -152,14 +151,14 @@ def _for_humanoid(settings: Settings) -> Settings:
         takeover=recover.takeover / 3,
     )
     model = replace(settings.model, max_timestep=2048)
-    return replace(settings, recover=recover, model=model, rounds=min(settings.rounds, 6))
+    return replace(settings, recover=recover, model=model)
 
 
 def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float) -> Settings:
-    """A controller that has to balance, disturbances that leave it standing, and for what lifts the method a head that
-    knows the heading and a longer memory."""
+    """A controller that has to balance, disturbances that leave it standing, fewer rounds; and for what lifts the
+    method, a head that knows the heading and a longer memory."""
     collect = replace(settings.collect, horizon=horizon, noise=calm * settings.collect.noise)
-    settings = replace(settings, sac=sac, collect=collect)
+    settings = replace(settings, sac=sac, collect=collect, rounds=min(settings.rounds, 6))
     if not settings.reprompt:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)

@@ -180,9 +180,13 @@ def share(source: Run, run: Run) -> None:
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     """A row with what made it."""
     config = read_json(run.folder / "config.json")
-    made = {key: config[key] for key in ("commit", "hardware", "created")}
     wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
-    return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | made
+    return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | origin(config)
+
+
+def origin(made: dict[str, Any]) -> dict[str, Any]:
+    """Of what a run's ``config.json`` or ``provenance`` says, what stands in every row."""
+    return {key: made[key] for key in ("commit", "hardware", "created")}
 
 
 def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, str]:

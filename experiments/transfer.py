@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
+from _variants import origin
 from matplotlib.figure import Figure
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
@@ -97,7 +98,7 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
                 policy = replace(target.model.policy, params=params_now)
                 episodes = evaluate(target.env, maze, pairs, "ct", policy=policy)
                 row = {"updates": mark, "maze": unseen[0], "episodes": options.episodes} | episodes.summary()
-                write_json(file, row | {name: made[name] for name in ("commit", "hardware", "created")})
+                write_json(file, row | origin(made))
             rows.append(read_json(file))
     checkpoints.close()
     return rows
