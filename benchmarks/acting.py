@@ -8,6 +8,7 @@ tokens again, which is how Hugging Face's Decision Transformer acts (torch; same
 ``--memory-gb``, or recomputing more than ``--recompute-steps`` tokens' states, are left out for it.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -93,7 +94,7 @@ def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callab
     """Some steps with the cache, as a rollout takes them: in one program, the cache updated in place."""
     now = {name: jnp.asarray(array[:, 0]) for name, array in window(n, 1).items()}
 
-    @jax.jit
+    @functools.partial(jax.jit, donate_argnums=1)  # as between the steps of a longer rollout: nothing is copied
     def act(params, cache):
         def step(cache, _):
             action, cache = model.apply(
@@ -101,11 +102,17 @@ def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callab
             )  # pyright: ignore
             return cache, action
 
-        return jax.lax.scan(step, cache, length=steps)[1]
+        return jax.lax.scan(step, cache, length=steps)
 
-    # a full window: every place of the ring is in use
+    # a full window: every place of the ring is in use; buffers of its own for each layer, as they are given away
     cache = empty_cache(model.config, ACTION, n).replace(now=jnp.array(2 * model.config.context_acting))
-    return lambda: act(params, cache)
+    held = [jax.tree.map(jnp.copy, cache)]
+
+    def go_on() -> object:
+        held[0], actions = act(params, held[0])
+        return actions
+
+    return go_on
 
 
 def recomputed(model: ControlTransformer, params: Any, inputs: dict[str, np.ndarray]) -> Callable[[], object]:

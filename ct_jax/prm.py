@@ -6,6 +6,7 @@ over a ``Maze``, or any other ``Space``.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import networkx as nx
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -163,8 +164,9 @@ def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     points = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
     pairs = _new_pairs(points, known, roadmap.config.connect_m)
     # Between samples the margin is kept; to given points only the radius.
-    clear = roadmap.radius_m + roadmap.config.margin_m * (pairs < roadmap.config.samples).all(1)
-    free = as_space(roadmap.maze).segment_free(points[pairs[:, 0]], points[pairs[:, 1]], clear)
+    first, second = pairs.T
+    clear = roadmap.radius_m + roadmap.config.margin_m * (np.maximum(first, second) < roadmap.config.samples)
+    free = as_space(roadmap.maze).segment_free(points.take(first, 0), points.take(second, 0), clear)
     return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs[free]]))
 
 
@@ -196,56 +198,64 @@ class MazeSpace:
 
     def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """As ``Space`` says."""
-        free, unclear = self._by_cells(a, b, radius)
-        ends, clear = np.stack([a, b], 1)[unclear], np.asarray(radius)[unclear]
+        ends, radius = np.stack([a, b], 1).astype(np.float32), np.asarray(radius, np.float32)
+        free, unclear = _in_blocks(functools.partial(_by_cells, self.maze), ends, radius)
+        ends, radius = ends[unclear], radius[unclear]
         longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).max(initial=0.0))
-        reach = segment_reach(longest, float(clear.max(initial=0.0)), float(self.maze.cell_m))
-        parts = []
-        for begin in range(0, len(ends), _BLOCK):  # in blocks that stay in the cache and share one program
-            n = len(ends[begin : begin + _BLOCK])
-            block, room = np.zeros((_bucket(n), 2, 2), np.float32), np.zeros(_bucket(n), np.float32)
-            block[:n], room[:n] = ends[begin : begin + n], clear[begin : begin + n]
-            parts.append(_segments_free(self.maze, jnp.asarray(block), jnp.asarray(room), reach))
-        free[unclear] = np.concatenate([np.zeros(0, bool), *map(np.asarray, parts)])[: len(ends)]
+        reach = segment_reach(longest, float(radius.max(initial=0.0)), float(self.maze.cell_m))
+        (free[unclear],) = _in_blocks(functools.partial(_segments_free, self.maze, reach=reach), ends, radius)
         return free
-
-    def _by_cells(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the cells alone tell of segments: which are free for certain, and which want the exact check.
-
-        A segment is free where the box around it holds no wall, and is not where its middle or a quarter is in one.
-        """
-        walls, cell = np.asarray(self.maze.walls), float(self.maze.cell_m)
-        counts = np.pad(walls.cumsum(0).cumsum(1), ((1, 0), (1, 0)))  # of walls below and left
-
-        def index(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            cells = np.floor(points / cell).astype(np.int64)  # the border is wall, and so is everything beyond it
-            return np.clip(cells[..., 1], 0, walls.shape[0] - 1), np.clip(cells[..., 0], 0, walls.shape[1] - 1)
-
-        around = np.asarray(radius)[:, None] + 1e-4  # more than rounding: never free where the exact check would not be
-        (bottom, left), (top, right) = index(np.minimum(a, b) - around), index(np.maximum(a, b) + around)
-        top, right = top + 1, right + 1
-        free = counts[top, right] - counts[bottom, right] - counts[top, left] + counts[bottom, left] == 0
-        blocked = np.zeros_like(free)
-        for share in (0.5, 0.25, 0.75):
-            blocked |= walls[index(a + share * (b - a))]
-        return free, ~free & ~blocked
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
         """As ``Space`` says. Raises UserError where the cells are too narrow."""
         return _sample_points(rng, self.maze, radius, n)
 
 
-def _bucket(n: int) -> int:
-    """Sizes of compiled edge checks: powers of two, so that few programs serve all roadmaps."""
-    return max(1024, 1 << (n - 1).bit_length())
+_BLOCK = 32_768  # most edges that are checked at once: they stay in the processor's cache and share one program
 
 
-_BLOCK = 8192  # most edges that are checked at once
+def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
+    """What a compiled check says of edges, ends [m, 2, 2] (m) and radii [m] (m): one or more bool [m]."""
+    found = []
+    for begin in range(0, max(len(ends), 1), _BLOCK):
+        n = min(len(ends) - begin, _BLOCK)
+        size = max(1024, 1 << (n - 1).bit_length())  # powers of two, so that few programs serve all roadmaps
+        block, room = np.zeros((size, 2, 2), np.float32), np.zeros(size, np.float32)
+        block[:n], room[:n] = ends[begin : begin + n], radius[begin : begin + n]
+        found.append([(flag, n) for flag in check(ends=block, radius=room)])
+    return [np.concatenate([np.asarray(flag)[:n] for flag, n in flags]) for flags in zip(*found, strict=True)]
+
+
+@jax.jit
+def _by_cells(
+    maze: Maze, ends: Float[Array, "m 2 2"], radius: Float[Array, "m"]
+) -> tuple[Bool[Array, "m"], Bool[Array, "m"]]:
+    """What the cells alone tell of edges: which are free for certain, and which want the exact check.
+
+    An edge is free where the box around it holds no wall, and is not where its middle or a quarter is in one.
+    """
+    height, width = maze.shape
+    counts = jnp.pad(jnp.cumsum(jnp.cumsum(maze.walls, 0), 1), ((1, 0), (1, 0)))  # of walls below and left
+
+    def index(points: Float[Array, "m 2"]) -> tuple[Int[Array, "m"], Int[Array, "m"]]:
+        """Cells of points [m]; the border is wall, and so is everything beyond it."""
+        row, column = (jnp.floor(points[:, i] / maze.cell_m).astype(jnp.int32) for i in (1, 0))
+        return jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
+
+    a, b = ends[:, 0], ends[:, 1]
+    around = radius[:, None] + 1e-4  # more than rounding: never free where the exact check would not be
+    (bottom, left), (top, right) = index(jnp.minimum(a, b) - around), index(jnp.maximum(a, b) + around)
+    top, right = top + 1, right + 1
+    free = counts[top, right] - counts[bottom, right] - counts[top, left] + counts[bottom, left] == 0
+    inside = [maze.walls[index(a + share * (b - a))] for share in (0.5, 0.25, 0.75)]
+    return free, ~free & ~functools.reduce(jnp.logical_or, inside)
 
 
 @functools.partial(jax.jit, static_argnames="reach")
-def _segments_free(maze: Maze, ends: Float[Array, "m 2 2"], radius: Float[Array, "m"], reach: int) -> jax.Array:
-    return jax.vmap(lambda e, r: segment_free(maze, e[0], e[1], radius=r, reach=reach))(ends, radius)
+def _segments_free(
+    maze: Maze, ends: Float[Array, "m 2 2"], radius: Float[Array, "m"], reach: int
+) -> tuple[Bool[Array, "m"]]:
+    return (jax.vmap(lambda e, r: segment_free(maze, e[0], e[1], radius=r, reach=reach))(ends, radius),)
 
 
 @jax.jit

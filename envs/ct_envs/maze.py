@@ -6,6 +6,7 @@ text file is read from its last line up. Arrays are padded with wall to a multip
 similar size share one compiled program. Everything outside the array is wall.
 """
 
+import functools
 from importlib import resources
 from pathlib import Path
 
@@ -274,10 +275,12 @@ def segment_free(
     Args:
         reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
     """
-    cells = cell_of(maze, (a + b) / 2)[None] + _neighbourhood(reach)
-    low = cells[:, ::-1] * maze.cell_m
-    distance = _segment_to_box(a, b, low, low + maze.cell_m)
-    return jnp.all(~is_wall(maze, cells) | ((distance >= radius) & (distance > 0)))
+    # Each coordinate by itself: on CPU, XLA then needs a sixth of the time.
+    middle, offset = cell_of(maze, (a + b) / 2), _neighbourhood(reach)
+    row, column = (middle[i] + offset[:, i] for i in (0, 1))
+    distance = _segment_to_box(a, b, column * maze.cell_m, row * maze.cell_m, maze.cell_m)
+    nearest = jnp.min(jnp.where(is_wall(maze, jnp.stack([row, column], -1)), distance, jnp.inf))
+    return (nearest >= radius) & (nearest > 0)
 
 
 def in_sight(
@@ -297,29 +300,36 @@ def segment_reach(max_length: float, radius: float, cell_m: float = CELL_M) -> i
 
 
 def _segment_to_box(
-    a: Float[Array, "2"], b: Float[Array, "2"], low: Float[Array, "n 2"], high: Float[Array, "n 2"]
+    a: Float[Array, "2"], b: Float[Array, "2"], left: Float[Array, "n"], bottom: Float[Array, "n"], side: jax.Array
 ) -> Float[Array, "n"]:
-    """Distance [m] between the segment a-b and axis-aligned boxes: 0, or to an end or a corner."""
+    """Distance [m] between the segment a-b and square boxes: 0, or to an end or a corner."""
+    (x, y), (dx, dy) = a, b - a
+    x_low, y_low = left - x, bottom - y  # from here on as seen from a
+    x_high, y_high = x_low + side, y_low + side
+    squared = jnp.maximum(dx * dx + dy * dy, 1e-12)
 
-    along = b - a
-    low, high = low - a[None], high - a[None]  # from here on as seen from a
+    def to_box(x: jax.Array, y: jax.Array) -> jax.Array:
+        across = jnp.maximum(jnp.maximum(x_low - x, x - x_high), 0.0)
+        up = jnp.maximum(jnp.maximum(y_low - y, y - y_high), 0.0)
+        return across * across + up * up
 
-    def to_box(point: jax.Array) -> jax.Array:
-        return jnp.linalg.norm(jnp.maximum(jnp.maximum(low - point[None], point[None] - high), 0.0), axis=-1)
+    def to_segment(x: jax.Array, y: jax.Array) -> jax.Array:
+        t = jnp.clip((x * dx + y * dy) / squared, 0.0, 1.0)
+        return (x - t * dx) ** 2 + (y - t * dy) ** 2
 
-    squared = jnp.maximum(along @ along, 1e-12)
-    x, y = (low[:, 0], high[:, 0]), (low[:, 1], high[:, 1])
-    corners = jnp.stack([jnp.stack([x[i], y[j]], -1) for i in (0, 1) for j in (0, 1)])  # [4, n, 2]
-    t = jnp.clip(corners @ along / squared, 0.0, 1.0)
-    to_segment = jnp.linalg.norm(corners - t[..., None] * along[None, None], axis=-1).min(0)
+    ends = [to_box(jnp.zeros_like(dx), jnp.zeros_like(dy)), to_box(dx, dy)]
+    corners = [to_segment(x, y) for x in (x_low, x_high) for y in (y_low, y_high)]
+    nearest = jnp.sqrt(functools.reduce(jnp.minimum, ends + corners))
 
-    # slab test: the parameter interval in which the segment is inside the box on both axes
-    safe = jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)[None]
-    t1, t2 = low / safe, high / safe
-    enter = jnp.maximum(jnp.minimum(t1, t2).max(-1), 0.0)
-    leave = jnp.minimum(jnp.maximum(t1, t2).min(-1), 1.0)
-    to_end = jnp.minimum(to_box(jnp.zeros_like(along)), to_box(along))
-    return jnp.where(enter <= leave, 0.0, jnp.minimum(to_end, to_segment))
+    def inside(low: jax.Array, high: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The parameters of the segment at which it enters and leaves a slab."""
+        safe = jnp.where(jnp.abs(d) < 1e-9, 1e-9, d)
+        return jnp.minimum(low / safe, high / safe), jnp.maximum(low / safe, high / safe)
+
+    (x_enter, x_leave), (y_enter, y_leave) = inside(x_low, x_high, dx), inside(y_low, y_high, dy)
+    enter = jnp.maximum(jnp.maximum(x_enter, y_enter), 0.0)
+    leave = jnp.minimum(jnp.minimum(x_leave, y_leave), 1.0)
+    return jnp.where(enter <= leave, 0.0, nearest)
 
 
 def sample_free(
