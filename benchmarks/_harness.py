@@ -7,6 +7,7 @@ import ast
 import importlib.util
 import io
 import json
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -26,6 +27,7 @@ RESULTS = Path(__file__).parent / "results"
 PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")
 LAST = "\n\nLast results:\n\n"
 _WIDTH = 116
+_FEWEST = 2  # rounds of a race
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class Options:
     """The long sweeps, too."""
     repeat: int = 7
     """Rounds, in each of which every contestant has its turn."""
+    limit_s: float = 6.0
+    """Time after which a race ends with fewer rounds than that, but at least two (--full: none)."""
     write: bool = True
     """Keep the results, and the table in the docstring; without it they are only printed."""
 
@@ -61,16 +65,20 @@ def about(docstring: str | None) -> str:
     return (docstring or "").split(LAST)[0]
 
 
-def time_together(*functions: Callable[[], object], repeat: int) -> list[list[float]]:
-    """Seconds of each, taken in turn (A B C A B C ...) after one warm-up, so that a drifting machine hurts none."""
-    times: list[list[float]] = [[] for _ in functions]
-    for round_ in range(repeat + 1):
-        for function, taken in zip(functions, times, strict=True):
+def time_together(*functions: Callable[[], object], repeat: int, limit_s: float = math.inf) -> list[list[float]]:
+    """Seconds of each, taken in turn (A B C A B C ...) after one warm-up, so that a drifting machine hurts none.
+
+    No further round begins after ``limit_s``, once there have been two.
+    """
+    rounds: list[list[float]] = []
+    while len(rounds) <= repeat and (len(rounds) <= _FEWEST or sum(map(sum, rounds[1:])) < limit_s):
+        taken = []
+        for function in functions:
             begun = time.perf_counter()
             jax.block_until_ready(function())
-            if round_:
-                taken.append(time.perf_counter() - begun)
-    return times
+            taken.append(time.perf_counter() - begun)
+        rounds.append(taken)
+    return [list(times) for times in zip(*rounds[1:], strict=True)]  # the first was the warm-up
 
 
 _FIGURES: dict[str, Callable[[float, float], float]] = {
@@ -104,7 +112,7 @@ class Results:
 
     def race(
         self, name: str, unit: str, ours: Contestant, others: dict[str, Contestant] | None = None, *,
-        asked: dict[str, float] | None = None, repeat: int | None = None,
+        asked: dict[str, float] | None = None,
     ) -> list[float]:  # fmt: skip
         """Time ours and all others together: a row for each other, with how many times as fast as it ours is.
 
@@ -118,7 +126,8 @@ class Results:
         others, asked = others or {}, asked or {}
         figure = _FIGURES.get(unit, lambda seconds, work: work / seconds)
         every = [ours, *others.values()]
-        times = time_together(*(each.run for each in every), repeat=repeat or self.options.repeat)
+        limit_s = math.inf if self.options.full else self.options.limit_s
+        times = time_together(*(each.run for each in every), repeat=self.options.repeat, limit_s=limit_s)
         values = [[figure(t, each.work) for t in taken] for each, taken in zip(every, times, strict=True)]
         for (label, rival), taken, other in zip(others.items(), times[1:], values[1:], strict=True):
             speeds = [(ours.work / a) / (rival.work / b) for a, b in zip(times[0], taken, strict=True)]

@@ -73,17 +73,15 @@ def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: 
     asked = {OMPL: 2.0} if samples == 1000 else {}
     results.race(f"{samples} samples: build", "ms", Contestant(lambda: build().edges), fast, asked=asked)
     if loop:
-        slow = 2 if samples > 200 else None
         asked = {LOOP: 50.0} if samples == 1000 else {}
         build_too = Contestant(lambda: build().edges)
-        results.race(f"{samples} samples: build", "ms", build_too, loop, asked=asked, repeat=slow)
+        results.race(f"{samples} samples: build", "ms", build_too, loop, asked=asked)
     if options.full or samples <= options.table_up_to:
         tabled = samples <= (1000 if options.full else options.loop_table_up_to)
         graph = roadmap.graph
         both = {LOOP: Contestant(lambda: (loop_roadmap(points, walls, cell, reach), loop_table(graph)))}
         name = f"{samples} samples: build and table"
-        few = 1 if samples > 200 else 3
-        results.race(name, "ms", Contestant(lambda: build().table), both if tabled else {}, repeat=few)
+        results.race(name, "ms", Contestant(lambda: build().table), both if tabled else {})
     query(maze, samples, roadmap, planner, results)
 
 
@@ -100,7 +98,7 @@ def query(maze: Maze, samples: int, roadmap: Roadmap, planner: "OmplPlanner | No
         planner.build(samples)
         others[OMPL] = Contestant(lambda: [planner.plan(*pair) for pair in pairs], len(pairs))
     ours = Contestant(lambda: [roadmap.plan(*pair) and None for pair in pairs], len(pairs))
-    results.race(f"{samples} samples: a plan", "ms", ours, others, repeat=3)
+    results.race(f"{samples} samples: a plan", "ms", ours, others)
 
 
 def growth(maze: Maze, options: PrmOptions, results: Results) -> None:

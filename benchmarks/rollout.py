@@ -271,7 +271,7 @@ def collection(robot: str, options: RolloutOptions, results: Results) -> None:
             return jnp.asarray(collect(jax.random.key(0), env, mazes, controller, config, settings.prm).length)
 
         name = f"{robot}, collection guided by {guide}"
-        results.race(name, "trajectories/s", Contestant(run, options.trajectories), repeat=min(2, options.repeat))
+        results.race(name, "trajectories/s", Contestant(run, options.trajectories))
 
 
 if __name__ == "__main__":

@@ -82,8 +82,7 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
         others[PEER] = peer(settings.model, window, updates, bf16=dtype == "bfloat16")
     asked = {PEER: 1.2} if not accelerator else {product: 0.4} if dtype == "bfloat16" and robot == "ant" else {}
     name = f"{robot}, {dtype}" + (", cuDNN attention" if attention == "cudnn" else "")
-    few = None if accelerator or options.full else min(3, options.repeat)
-    times = results.race(name, "steps/s", ours, others, asked=asked, repeat=few)
+    times = results.race(name, "steps/s", ours, others, asked=asked)
     results.add(name, "GFLOP/s", [updates * step_flop / 1e9 / t for t in times])
 
 

@@ -107,8 +107,10 @@ class Block(nn.Module):
 
     def heads(self, x: Float[Array, "B T W"]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Queries, keys and values, each [B, T, heads, W / heads]."""
-        split = self.qkv(self.norm_attention(x)).reshape(*x.shape[:-1], 3, self.config.heads, -1)
-        return split[..., 0, :, :], split[..., 1, :, :], split[..., 2, :, :]
+        # Split, not indexed: the gradients are then joined again, and not each of them padded to the whole and added.
+        q, k, v = jnp.split(self.qkv(self.norm_attention(x)), 3, -1)
+        heads = (*x.shape[:-1], self.config.heads, -1)
+        return q.reshape(heads), k.reshape(heads), v.reshape(heads)
 
     def attend(
         self, x: jax.Array, q: jax.Array, k: jax.Array, v: jax.Array, mask: Bool[Array, "B T M"], deterministic: bool

@@ -52,11 +52,18 @@ def test_contestants_take_turns_after_a_warm_up(monkeypatch):
     assert clock.order == ["a", "b"] * 3
 
 
+@pytest.mark.parametrize(("limit_s", "rounds"), [(100.0, 5), (12.0, 3), (0.0, 2)])
+def test_a_race_that_takes_long_has_fewer_rounds_but_two(monkeypatch, limit_s, rounds):
+    clock = Clock(monkeypatch)
+    a, b = clock.contestant("a", 1.0), clock.contestant("b", 4.0)
+    assert time_together(a.run, b.run, repeat=5, limit_s=limit_s) == [[1.0] * rounds, [4.0] * rounds]
+
+
 @pytest.mark.parametrize(("unit", "value", "other"), [("steps/s", 4.0, 1.0), ("ms", 250.0, 1000.0)])
 def test_a_ratio_says_how_many_times_as_fast_ours_is(tmp_path, monkeypatch, unit, value, other):
     """Whatever is counted: for each unit of work, pair by pair."""
     clock = Clock(monkeypatch)
-    race = results(tmp_path, monkeypatch, repeat=3)
+    race = results(tmp_path, monkeypatch, repeat=3, limit_s=60.0)
     ours, rival = clock.contestant("a", 1.0, 2.0, 1.0, 1.0, work=4.0), clock.contestant("b", 2.0, work=2.0)
     race.race("walk", unit, ours, {"rival": rival}, asked={"rival": 3.0})
     (row,) = race._rows
