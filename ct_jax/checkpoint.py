@@ -21,6 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from ct_envs import UserError
+from ct_jax import devices
 from ct_jax.interrupts import rescued_by, uninterrupted
 
 Tree = TypeVar("Tree")
@@ -100,7 +101,7 @@ class Checkpoints:
         plain = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
         leaves = {str(i): leaf for i, leaf in enumerate(jax.tree.leaves(plain))}
         with self._lock, uninterrupted():
-            if step in self._manager.all_steps():
+            if devices.first(lambda: step in self._manager.all_steps()):
                 return
             try:
                 self._manager.save(step, args=_Save(leaves))  # pyright: ignore[reportCallIssue]
@@ -117,24 +118,22 @@ class Checkpoints:
 
     def maybe_save(self, step: int, state: Any) -> None:
         """Save if the last time is long enough ago."""
-        if time.monotonic() - self._last >= self._every_s:
+        if devices.largest(time.monotonic() - self._last >= self._every_s):
             self.save(step, state)
 
     def restore(self, like: Tree) -> tuple[int, Tree] | None:
-        """(step, state) of the newest whole checkpoint, with the structure of ``like``; None where there is none.
+        """(step, state) of the newest whole checkpoint, with the structure of ``like`` and on its devices, however many
+        it was saved from; None where there is none.
 
         A damaged one is put aside with a warning on stderr, and the one before it is taken.
         """
-        for step in sorted(self._manager.all_steps(), reverse=True):
+        for step in devices.first(lambda: sorted(self._manager.all_steps(), reverse=True)):
             folder = self._folder / str(step)
             try:
-                _check_manifest(folder / "default")  # as Orbax calls what is saved without a name
+                devices.first(lambda folder=folder: _check_manifest(folder / "default"))  # Orbax's name of the nameless
                 return step, self._read(step, like)
             except (ValueError, KeyError, OSError) as bad:
-                reason = " ".join(str(bad).split())[:200]
-                print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
-                with suppress(FileNotFoundError):  # another process of the same training was quicker
-                    folder.rename(folder.with_name(f"damaged-{step}-{time.time_ns()}"))
+                devices.first(lambda folder=folder, bad=bad: _put_aside(folder, bad))
                 self._manager.reload()
         return None
 
@@ -149,6 +148,13 @@ class Checkpoints:
 
     def close(self) -> None:
         self._manager.close()
+
+
+def _put_aside(folder: Path, bad: Exception) -> None:
+    reason = " ".join(str(bad).split())[:200]
+    print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
+    with suppress(FileNotFoundError):  # another process of the same training was quicker
+        folder.rename(folder.with_name(f"damaged-{folder.name}-{time.time_ns()}"))
 
 
 def _text(error: Exception) -> str:

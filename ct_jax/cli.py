@@ -40,6 +40,20 @@ examples:
 
 
 @dataclass(frozen=True)
+class Processes:
+    """Several processes, each started with the same command and the same folder."""
+
+    cluster: FlagCreatePairsOff[bool] = False
+    """This is one of several processes; JAX finds the others (Slurm, Open MPI, Kubernetes, Cloud TPU)."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: none)")] = None
+    """This is one of several processes; the address of the first, with any port that is free there."""
+    processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(with --coordinator)")] = None
+    """How many there are."""
+    process: Annotated[int | None, arg(metavar="I", help_behavior_hint="(with --coordinator)")] = None
+    """Which of them this is, from 0."""
+
+
+@dataclass(frozen=True)
 class Train:
     """Train a robot end to end: roadmap, controller, trajectories, transformer, evaluation, report.
 
@@ -72,6 +86,7 @@ class Train:
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in the folder: finished stages are skipped."""
+    among: Annotated[Processes, arg(name="")] = Processes()
 
 
 @dataclass(frozen=True)
@@ -110,6 +125,7 @@ class Evaluate:
     """Draw all episodes in the maze: a .png, .svg or .pdf file."""
     json: FlagCreatePairsOff[bool] = False
     """Print one JSON object and nothing else."""
+    among: Annotated[Processes, arg(name="")] = Processes()
 
 
 @dataclass(frozen=True)
@@ -239,8 +255,8 @@ def _reason(text: str) -> str:
 # -------------------------------------------------------------------------------------------------------- commands
 
 
-def prepare_jax() -> None:
-    """One CPU device a core, exact float32 products, and compiled programs that are kept."""
+def prepare_jax(among: Processes = Processes()) -> None:
+    """One CPU device a core, exact float32 products, compiled programs that are kept, and the other processes."""
     with contextlib.redirect_stdout(io.StringIO()):  # MJX says that warp, which we do not use, is missing
         import jax
 
@@ -252,6 +268,10 @@ def prepare_jax() -> None:
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning
     keep_programs()
+    if among != Processes():
+        from ct_jax.devices import start
+
+        start(among.coordinator, among.processes, among.process)
     try:
         jax.devices()
     except RuntimeError as bad:
@@ -265,9 +285,11 @@ def _train(command: Train) -> None:
 
     if get_robot(command.robot).course == "room":
         _check_in_rooms(command)  # before what takes seconds
-    prepare_jax()
+    _check_processes(command.among)
+    prepare_jax(command.among)
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
+    from ct_jax.devices import is_first
     from ct_jax.model import load_controller
     from ct_jax.presets import get_preset
     from ct_jax.run import Run, default_mazes, load_mazes
@@ -288,8 +310,30 @@ def _train(command: Train) -> None:
         engine=command.engine,
     )
     report = pipeline.train(run, resume=command.resume)
-    print_rows(pipeline.results(run.folder))
-    print(f"model:  {run.folder / 'model'}\nreport: {report}")
+    if is_first():
+        print_rows(pipeline.results(run.folder))
+        print(f"model:  {run.folder / 'model'}\nreport: {report}")
+
+
+def _check_processes(among: Processes) -> None:
+    """Raises UserError unless the options say who this process is."""
+    named = (among.coordinator, among.processes, among.process)
+    if among.cluster:
+        if any(value is not None for value in named):
+            raise UserError("--cluster finds the processes by itself; leave out --coordinator, --processes, --process")
+        return
+    if all(value is None for value in named):
+        return
+    if None in named:
+        raise UserError("--coordinator HOST:PORT, --processes N and --process I go together; give all three")
+    assert among.coordinator is not None and among.processes is not None and among.process is not None
+    host, _, port = among.coordinator.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise UserError(f"--coordinator {among.coordinator}: give HOST:PORT, such as 10.0.0.1:1234")
+    if among.processes < 1:
+        raise UserError(f"--processes {among.processes}: give 1 or more")
+    if not 0 <= among.process < among.processes:
+        raise UserError(f"--process {among.process}: give a number from 0 to {among.processes - 1}")
 
 
 def _check_in_rooms(command: Train) -> None:
@@ -304,13 +348,17 @@ def _check_in_rooms(command: Train) -> None:
 
 
 def _evaluate(command: Evaluate) -> None:
+    _check_processes(command.among)
     with _stdout_to_stderr() if command.json else contextlib.nullcontext():
-        prepare_jax()
+        prepare_jax(command.among)
         from ct_jax import pipeline
+        from ct_jax.devices import is_first
 
         names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "picture")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
+    if not is_first():
+        return
     if command.json:
         print(json.dumps(row))
     else:

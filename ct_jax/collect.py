@@ -10,6 +10,7 @@ from brax.envs.base import State
 
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze, sample_pair
+from ct_jax.devices import data_mesh, fill_up, joined, own, own_rows, place, sharded
 from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap
@@ -45,16 +46,21 @@ def run_episodes(
     limit: int,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[State, object, Steps]:
-    """Roll out until all episodes are over, or ``limit`` steps, in compiled chunks; steps as NumPy [T, N, ...].
+    """Roll out until all episodes are over, or ``limit`` steps, in compiled chunks.
 
     Args:
+        state: from ``start_episodes``.
         on_progress: told (steps, episodes that are over) after every ``chunk``.
+
+    Returns:
+        The last state and memory, and the steps of this process's own episodes as NumPy [T, n, ...].
     """
+    mesh = data_mesh()
     parts, chunk = [], min(chunk, limit)
     for i in range(-(-limit // chunk)):
-        state, memory, steps = rollout(env, policy, state, memory, jax.random.fold_in(key, i), chunk)  # pyright: ignore
-        parts.append(jax.tree.map(np.asarray, steps))
-        over = int((np.asarray(state.done) > 0).sum())
+        state, memory, steps = rollout(env, policy, state, memory, jax.random.fold_in(key, i), chunk, mesh)  # pyright: ignore
+        parts.append(own(steps, mesh, axis=1))
+        over = int((state.done > 0).sum())
         raise_if_interrupted()
         if on_progress is not None:
             on_progress((i + 1) * chunk, over)
@@ -64,10 +70,11 @@ def run_episodes(
 
 
 def start_episodes(env: MazeEnv, key: jax.Array, maze: Maze, start: jax.Array, goal: jax.Array) -> State:
-    """States of N episodes with the given mazes (leading axis N), starts and goals [N, 2] (m)."""
+    """States of N episodes with the given mazes (leading axis N), starts and goals [N, 2] (m). The devices share them,
+    so there must be as many as ``fill_up`` says."""
     n = len(start)
     tasks = Tasks(start[:, None], goal[:, None], jnp.ones(n, jnp.int32))
-    return _reset(env)(jax.random.split(key, n), maze, tasks)
+    return _reset(env)(*place((jax.random.split(key, n), maze, tasks), sharded(data_mesh())))
 
 
 _resets: dict[int, tuple[MazeEnv, Callable]] = {}
@@ -138,8 +145,7 @@ def collect(
         batch = draw_batch(batch_key, env, mazes, config, prm, first_maze=first // config.reset_interval)
         memory = policy.init(batch.state, plan_memory(policy.guide, batch.tables, batch.which, batch.state))
         state, _, steps = run_episodes(env, policy, batch.state, memory, run_key, limit=config.horizon)
-        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
-        return data, np.asarray(state.info["success"]) > 0
+        return batch.outcome(state, steps)[:2]
 
     return gather(config, wave, on_progress)
 
@@ -152,7 +158,11 @@ def gather(
     """The loop of Algorithm 3: episodes, wave after wave, until T have succeeded; only successes are kept.
 
     Args:
-        wave: given the number of its first episode, ``config.envs`` episodes and which of them succeeded.
+        wave: given the number of its first episode, this process's share of ``config.envs`` episodes, the same for
+            all, and which of them succeeded.
+
+    Returns:
+        This process's share.
 
     Raises:
         UserError: too few successes within ``give_up * T`` episodes.
@@ -166,10 +176,12 @@ def gather(
                 "train it longer or look at its success on edges"
             )
         data, won = wave(episodes)
-        kept.append(select(data, won))
-        successes, episodes = successes + int(won.sum()), episodes + config.envs
+        everyone = joined(won)
+        among = everyone & (successes + np.cumsum(everyone) <= config.trajectories)
+        kept.append(select(data, own_rows(among)))
+        successes, episodes = successes + int(everyone.sum()), episodes + config.envs
         on_progress(successes, episodes)
-    return select(concatenate(kept), np.arange(config.trajectories))
+    return concatenate(kept)
 
 
 @dataclass(frozen=True)
@@ -180,6 +192,14 @@ class Batch:
     tables: PlanTable  # leading axis: roadmaps
     which: jax.Array  # int32 [N]: roadmap of each episode
     maze: np.ndarray  # int [N]: maze of each episode
+    real: np.ndarray  # bool [N]: false for copies, which are there so that the devices share the episodes evenly
+
+    def outcome(self, state: State, steps: Steps) -> tuple[Trajectories, np.ndarray, np.ndarray]:
+        """This process's episodes, which of them succeeded, and which fell."""
+        ends = own({name: state.info[name] for name in ("goal", "success", "fall")}, data_mesh())
+        real = own_rows(self.real)
+        data = to_trajectories(steps, ends["goal"], own_rows(self.maze))
+        return data, real & (ends["success"] > 0), real & (ends["fall"] > 0)
 
 
 def draw_batch(
@@ -201,11 +221,12 @@ def draw_batch(
         for k, m in zip(keys[:-1], maze_of_map, strict=True)
     ]
     tables = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[table for table, _, _ in drawn])
-    start, goal = (jnp.concatenate([each[i] for each in drawn])[: config.envs] for i in (1, 2))
-    which = np.repeat(np.arange(n_maps), per_map)[: config.envs]
+    order = fill_up(config.envs, data_mesh())
+    start, goal = (jnp.concatenate([each[i] for each in drawn])[order] for i in (1, 2))
+    which = np.repeat(np.arange(n_maps), per_map)[order]
     maze = jax.tree.map(lambda leaf: leaf[maze_of_map[which]], mazes)
     state = start_episodes(env, keys[-1], maze, start, goal)
-    return Batch(state, tables, jnp.asarray(which), maze_of_map[which])
+    return Batch(state, tables, jnp.asarray(which), maze_of_map[which], np.arange(len(order)) < config.envs)
 
 
 def plan_memory(guide: RoadmapGuide | ExplorerGuide, tables: PlanTable, which: jax.Array, state: State) -> object:

@@ -14,6 +14,7 @@ from scipy import stats
 from ct_envs import MazeEnv
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
+from ct_jax.devices import data_mesh, fill_up, joined, own
 from ct_jax.policy import Conditioned
 from ct_jax.prm import PlanTable, PrmConfig, build_roadmap, extend
 from ct_jax.rollout import Controller, Guided, Policy, Steps
@@ -127,22 +128,23 @@ def evaluate(
     prm: PrmConfig | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
-    """Run one method on all pairs at once.
+    """Run one method on all pairs at once, which all devices share.
 
     Args:
         env: with maps, without auto-reset.
         method: "planner" (the full map, needs ``controller``), "explorer" (likewise), or any name for ``policy``.
     """
     begun = time.perf_counter()
-    n = len(pairs.start)
+    order = fill_up(len(pairs.start), data_mesh())
+    n = len(order)
     key = jax.random.key(pairs.seed)
     mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
-    state = start_episodes(env, key, mazes, jnp.asarray(pairs.start), jnp.asarray(pairs.goal))
+    state = start_episodes(env, key, mazes, jnp.asarray(pairs.start[order]), jnp.asarray(pairs.goal[order]))
     asked = None
     if method not in GUIDED:
         assert policy is not None
         actor, memory = policy, policy.init(state)
-        asked = np.asarray(memory.rtg) if isinstance(memory, Conditioned) else None
+        asked = memory.rtg if isinstance(memory, Conditioned) else None
     else:
         assert controller is not None
         prm = prm or PrmConfig()
@@ -157,23 +159,26 @@ def evaluate(
 
 
 def _outcome(
-    horizon: int, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: np.ndarray | None
+    horizon: int, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: jax.Array | None
 ) -> Episodes:
-    success, fell = (np.asarray(state.info[name]) > 0 for name in ("success", "fall"))
-    alive = np.asarray(steps.alive)
-    path = np.asarray(steps.position)
-    whole = np.concatenate([path, np.asarray(state.info["position"])[None]])
-    lying = fell * np.asarray(state.reward) * (horizon - alive.sum(0))
-    return Episodes(
-        success=success,
-        collided=(np.asarray(steps.collision) * alive).sum(0) > 0,
-        fell=fell,
-        timeout=~success & ~fell,
-        steps=alive.sum(0),
-        returns=(np.asarray(steps.reward) * alive).sum(0) + lying,
-        travelled_m=np.linalg.norm(np.diff(whole, axis=0), axis=-1).sum(0),
-        path=path,
-        pairs=pairs,
-        wall_s=wall_s,
-        asked=asked,
-    )
+    """What happened to the pairs, from the steps of each process's own."""
+    names = ("success", "fall", "position")
+    end = own({name: state.info[name] for name in names} | {"reward": state.reward, "asked": asked}, data_mesh())
+    success, fell = end["success"] > 0, end["fall"] > 0
+    alive, path = steps.alive, steps.position
+    whole = np.concatenate([path, end["position"][None]])
+    lying = fell * end["reward"] * (horizon - alive.sum(0))
+    each = {
+        "success": success,
+        "collided": (steps.collision * alive).sum(0) > 0,
+        "fell": fell,
+        "timeout": ~success & ~fell,
+        "steps": alive.sum(0),
+        "returns": (steps.reward * alive).sum(0) + lying,
+        "travelled_m": np.linalg.norm(np.diff(whole, axis=0), axis=-1).sum(0),
+        "asked": end["asked"],
+    }
+    n = len(pairs.start)
+    each = {name: None if rows is None else joined(rows)[:n] for name, rows in each.items()}
+    every_path = joined(np.swapaxes(path, 0, 1))[:n]
+    return Episodes(**each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s)

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ct_envs import MazeEnv, UserError
 from ct_envs.maze import Maze
-from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes, to_trajectories
+from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes
+from ct_jax.devices import joined
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action, Controller, Guided
@@ -120,8 +121,7 @@ def recover(
         plan = plan_memory(guide, batch.tables, batch.which, batch.state)
         memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
         state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
-        data = to_trajectories(steps, np.asarray(state.info["goal"]), batch.maze)
-        return data, np.asarray(state.info["success"]) > 0, np.asarray(state.info["fall"]) > 0
+        return batch.outcome(state, steps)
 
     return gather_recoveries(config, collecting.envs, env.horizon, wave, on_progress)
 
@@ -137,7 +137,8 @@ def gather_recoveries(
 
     Args:
         envs: episodes of a wave, of at most ``horizon`` steps.
-        wave: given the number of its first episode, its episodes, which of them succeeded, and which fell.
+        wave: given the number of its first episode, this process's share of its episodes, which of them succeeded, and
+            which fell.
 
     Raises:
         UserError: as ``recover``.
@@ -155,7 +156,7 @@ def gather_recoveries(
         else:
             rescued = rescued & (data.learn.sum(1) > 0)
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
-        recoveries, episodes = recoveries + int(rescued.sum()), episodes + envs
+        recoveries, episodes = recoveries + int(joined(rescued).sum()), episodes + envs
         on_progress(recoveries, episodes)
     if not recoveries:
         raise UserError(f"no recovery in {episodes} episodes; the policy hardly fails, so skip fine-tuning")

@@ -1,10 +1,11 @@
 """Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-C).
 
 The data lie in memory as arrays; a compiled step draws its own windows from them, recomputes their maps and updates the
-parameters, so the host does nothing but watch. Batches are sharded over the devices of a mesh with one axis, "data".
+parameters, so the host does nothing but watch. Trajectories and batches are sharded over the devices of ``data_mesh``:
+all draw the same windows, each hands over the steps of them that it holds, and each takes its share of the batch.
 """
 
-import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ct_envs import Robot, UserError
 from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
@@ -62,12 +64,6 @@ class FitState:
     update: jax.Array
 
 
-def data_mesh(batch: int) -> Mesh:
-    """As many devices as share a batch evenly, along one axis, "data"."""
-    n = max(d for d in range(1, jax.device_count() + 1) if batch % d == 0)
-    return jax.make_mesh((n,), ("data",), axis_types=(jax.sharding.AxisType.Auto,), devices=jax.devices()[:n])
-
-
 Loss = Callable[[Any, Window, jax.Array], jax.Array]
 
 
@@ -88,18 +84,17 @@ class Fit:
             optax.adamw(rate, weight_decay=config.weight_decay, mask=_matrices),
         )
         self.mesh = data_mesh(config.batch)
-        self.train = jax.jit(self._train, static_argnames="updates")
+        self.train = jax.jit(self._train, static_argnames="updates", out_shardings=replicated(self.mesh))
 
     def create(self, key: jax.Array, params: Any) -> FitState:
         """The state before training, replicated over the devices."""
         state = FitState(params, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
-        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self.mesh, PartitionSpec()))
+        return place(jax.tree.map(jnp.array, state), replicated(self.mesh))
 
     def _train(
         self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze | None, updates: int
     ) -> tuple[FitState, jax.Array]:
         """Run some updates (static); returns the mean loss over them."""
-        shard = NamedSharding(self.mesh, PartitionSpec("data"))
 
         def update(state: FitState, _) -> tuple[FitState, jax.Array]:
             draw, drop = jax.random.split(jax.random.fold_in(state.key, state.update))
@@ -114,7 +109,7 @@ class Fit:
                 symmetries=self._symmetries,
                 shift_timestep=self.config.shift_timestep,
             )
-            window = jax.lax.with_sharding_constraint(window, shard)
+            window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
             loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)
             change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
             params = optax.apply_updates(state.params, change)
@@ -170,18 +165,33 @@ def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m:
     """
     last = np.maximum(np.asarray(data.length) - 1, 0)
     keep = np.asarray(at_goal(np.asarray(data.reward)[np.arange(data.n), last], goal_tolerance_m))
-    if not keep.any():
+    if not joined(keep).any():
         raise UserError("no trajectory arrives at its goal; collect anew")
     if config.collision_free:
         inside = np.arange(data.collision.shape[1]) < np.asarray(data.length)[:, None]
         keep &= ~((np.asarray(data.collision) > 0) & inside).any(1)
-        if not keep.any():
+        if not joined(keep).any():
             raise UserError("every trajectory has a collision: give the roadmap a margin, or allow collisions")
     if config.top < 1.0:
         straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
         score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
-        keep &= score >= np.quantile(score[keep], 1.0 - config.top)
+        keep &= score >= np.quantile(joined(score[keep]), 1.0 - config.top)
     return select(data, keep)
+
+
+def spread(data: Trajectories, mesh: Mesh) -> tuple[Trajectories, Float[Array, "N T"]]:
+    """The trajectories of all processes as one set over their devices, and their returns-to-go.
+
+    The lengths, from which windows are drawn, are on every device: they are small, and so nothing but the steps that
+    were drawn ever travels.
+    """
+    # A dataset that grows from round to round compiles anew only when it outgrows these.
+    rows = math.lcm(1024, len(mesh.local_devices))
+    data = pad(data, -(-largest(data.n) // rows) * rows, -(-largest(data.position.shape[1]) // 256) * 256)
+    data = feed(data, mesh)
+    rtg = jax.jit(lambda d: d.rtg)(data)
+    everywhere = jax.jit(lambda lengths: lengths, out_shardings=replicated(mesh))
+    return data.replace(length=everywhere(data.length)), rtg
 
 
 def fit(
@@ -199,15 +209,14 @@ def fit(
     """Train to the configured number of updates; returns the parameters, on the host.
 
     Args:
+        data: this process's own trajectories; those of all processes are one set.
         updates: stop already after so many; ``checkpoints`` allow to go on from there.
         on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, params)
-    # A dataset that grows from round to round compiles anew only when it outgrows these.
-    data = pad(data, -(-data.n // 1024) * 1024, -(-data.position.shape[1] // 256) * 256)
-    place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
-    data, rtg, mazes = place(data), place(jax.jit(lambda d: d.rtg)(data)), place(mazes)
+    data, rtg = spread(data, learner.mesh)
+    mazes = place(mazes, replicated(learner.mesh))
     state = run_to(
         updates or learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
         lambda state: int(state.update), on_progress, checkpoints, chunk,

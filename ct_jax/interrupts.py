@@ -28,14 +28,24 @@ _KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
 _waiting: list[type[KeyboardInterrupt]] = []
 _holders: list[object] = []
 _rescues: list[Callable[[], None]] = []
+_largest: Callable[[int], int] | None = None  # of the numbers that several processes name
+
+
+def obey_together(largest: Callable[[int], int]) -> None:
+    """With several processes a signal to any of them stops all, where all look for one, and only there."""
+    global _largest
+    _largest = largest
 
 
 def raise_if_interrupted() -> None:
     """Raise what a signal asked for during a callback. Long loops call it between their compiled programs."""
-    if _waiting:
-        kind = _waiting[0]
+    kinds = [None, *_KINDS.values()]
+    kind = kinds.index(_waiting[0]) if _waiting else 0
+    if _largest is not None:
+        kind = _largest(kind)
+    if kind:
         _waiting.clear()
-        raise kind
+        raise kinds[kind]
 
 
 @contextmanager
@@ -96,7 +106,7 @@ def _watch(reader: int, over: threading.Event, farewell: str) -> None:
     while signals := os.read(reader, 64):
         if signal.SIGTERM in signals and not over.wait(GRACE_S):
             break
-    if over.is_set():
+    if over.is_set() or _largest is not None:  # one process can save nothing without the others
         return
     for save in reversed(_rescues):
         try:
@@ -109,7 +119,7 @@ def _watch(reader: int, over: threading.Event, farewell: str) -> None:
 
 def _handle(number: int, frame: FrameType | None) -> None:
     kind = _KINDS[signal.Signals(number)]
-    if _holders or _in_callback(frame):
+    if _holders or _largest is not None or _in_callback(frame):
         _waiting.append(kind)
     else:
         raise kind

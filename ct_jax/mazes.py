@@ -11,6 +11,7 @@ import numpy as np
 
 from ct_envs import Maze, MazeEnv, UserError, load_maze
 from ct_envs.maze import unpadded
+from ct_jax import devices
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
@@ -48,9 +49,9 @@ class MazeCourse:
                 controller, tested = train_controller(
                     run.key("controller"), run.env, roadmap.maze, roadmap, config, **watch
                 )
-            save_controller(folder, run.robot, config, controller, run.made | tested)
+            devices.first(lambda: save_controller(folder, run.robot, config, controller, run.made | tested))
             info |= tested
-        return controller, config
+        return load_controller(str(run.folder), run.robot)  # the first process's, in all
 
     def collect(self, key: jax.Array, controller: SacController, folder: Path, on_progress: Progress) -> Trajectories:
         """Algorithm 3: in mazes so quick that nothing need be kept on the way."""
@@ -92,7 +93,8 @@ def _roadmap(run: Run) -> Roadmap:
     roadmap = build_roadmap(run.key("prm"), maze, radius_m=run.spec.radius_m, config=run.settings.prm)
     if run.done("prm") is None:
         with run.stage("prm") as (folder, info):
-            np.savez_compressed(folder / "roadmap.npz", points=roadmap.points, edges=roadmap.edges)
+            file = folder / "roadmap.npz"
+            devices.first(lambda: np.savez_compressed(file, points=roadmap.points, edges=roadmap.edges))
             info |= {"points": len(roadmap.points), "edges": len(roadmap.edges)}
     return roadmap
 
@@ -134,12 +136,12 @@ def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
     """The evaluation's pairs: drawn once, written down, and read back ever after."""
     robot, n, seed = run.spec, run.settings.episodes, run.settings.pairs_seed
     file = run.folder / "evaluate" / f"pairs-{slug(name)}-{n}-{seed}.json"
-    if file.is_file():
-        found = read_json(file)
+    found = devices.first(lambda: read_json(file) if file.is_file() else None)
+    if found is not None:
         start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
         return Pairs(start, goal, shortest_m, seed)
     pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    write_json(file, {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS})
+    devices.first(lambda: write_json(file, {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS}))
     return pairs
 
 
@@ -166,7 +168,7 @@ def evaluate_in_maze(
     name = Path(maze).stem
     outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
     row = head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
-    if picture is not None:
+    if picture is not None and devices.is_first():
         from ct_jax.report import pictures  # matplotlib, which takes its time
 
         reached = f"{int(outcome.success.sum())} of {len(outcome.success)} reached the goal"

@@ -17,6 +17,7 @@ import numpy as np
 
 from ct_envs import UserError
 from ct_envs.robots import Robot, get_robot
+from ct_jax import devices
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.controllers.sac import SacConfig
@@ -69,6 +70,7 @@ def train(run: Run, *, resume: bool = False) -> Path:
         UserError: bad input, or a stage that cannot succeed.
         KeyboardInterrupt: Ctrl-C; ``resume`` goes on from there.
     """
+    _check_processes(run.spec)
     from ct_jax.report import write_report  # matplotlib, which takes its time and has its say about folders
 
     with open_run(run, resume=resume):
@@ -79,14 +81,14 @@ def train(run: Run, *, resume: bool = False) -> Path:
             _evaluate(run, course, model)
         finally:
             metrics.close()
-        return write_report(run.folder)
+        return Path(devices.first(lambda: str(write_report(run.folder))))
 
 
 def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
     """The trained model, learned or, if the stages up to it are finished, read back."""
     last = "finetune" if run.settings.rounds else "fit"
     folder = run.folder / "model"
-    if run.done(last) is not None and (folder / "model.json").is_file():
+    if run.done(last) is not None and devices.first((folder / "model.json").is_file):
         return load_model(str(run.folder))
     controller, sac = course.controller(metrics)
     data = _collect(run, course, controller)
@@ -94,7 +96,7 @@ def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
     if run.settings.rounds:
         policy = _finetune(run, course, policy, controller, data, metrics)
     model = TrainedModel(run.robot, replace(run.settings, sac=sac), policy, controller, run.made)
-    save_model(folder, model)
+    devices.first(lambda: save_model(folder, model))
     return model
 
 
@@ -124,8 +126,8 @@ def _read_trajectories(run: Run, file: Path) -> Trajectories:
 
 def describe(data: Trajectories) -> dict[str, Any]:
     """Size of a dataset in words and numbers."""
-    length = np.asarray(data.length)
-    counts = {"trajectories": data.n, "steps": int(length.sum()), "bytes": data.nbytes}
+    length, sizes = devices.joined(np.asarray(data.length)), devices.joined(np.array([data.nbytes]))
+    counts = {"trajectories": len(length), "steps": int(length.sum()), "bytes": int(sizes.sum())}
     return counts | {"mean_length": float(length.mean())}
 
 
@@ -180,11 +182,11 @@ def _fit_network(
     """Fit one network with a bar, metrics and checkpoints; its weights, once there, are read back."""
     folder = run.folder / stage
     file = folder / f"{name}.safetensors"
-    if file.is_file():
+    if devices.first(file.is_file):
         return jax.tree.map(jnp.asarray, load_weights(file, params, mend=run.mend(stage)))
     with training(folder, name, learner.config.updates, metrics) as watch:
         params = fit(key, learner, params, data, run.stacked, **watch)
-    save_weights(file, params)
+    devices.first(lambda: save_weights(file, params))
     return params
 
 
@@ -199,7 +201,7 @@ def _finetune(
         for number in range(1, run.settings.rounds + 1):
             data = storage.concatenate([data, _recoveries(run, course, number, policy, controller)])
             policy = _fit_both(run, "finetune", number, policy, data, metrics)
-            drop_leftovers(folder)
+            devices.first(lambda: drop_leftovers(folder))
         info |= {"rounds": run.settings.rounds} | describe(data)
     return policy
 
@@ -207,16 +209,14 @@ def _finetune(
 def _recoveries(run: Run, course: Course, number: int, policy: TransformerPolicy, controller: Any) -> Trajectories:
     """Failures and recoveries of a round."""
     file = run.folder / "finetune" / f"trajectories-{number}.npz"
-    if file.is_file():
+    if storage.is_saved(file):
         return _read_trajectories(run, file)
     with Bar(f"recover-{number}", run.settings.recover.recoveries) as bar:
         found = course.recover(
             jax.random.fold_in(run.key("finetune"), number), policy, controller, file.parent / f"waves-{number}",
             lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
         )  # fmt: skip
-    part = file.with_name("part-" + file.name)
-    storage.save(found, part)
-    part.replace(file)
+    storage.save(found, file)
     return found
 
 
@@ -249,13 +249,20 @@ def evaluate_model(run: str, *, method: str, seed: int, **options: Any) -> dict[
     if method not in METHODS:
         raise UserError(f"no method named '{method}'; methods: {', '.join(METHODS)}")
     model = load_model(run)
-    evaluation = _EVALUATIONS[get_robot(model.robot).course]
+    robot = get_robot(model.robot)
+    _check_processes(robot)
+    evaluation = _EVALUATIONS[robot.course]
     known = inspect.signature(evaluation).parameters
     known = [name for name, parameter in known.items() if parameter.kind is parameter.KEYWORD_ONLY]
     for name in options:
         if name not in known:
             raise UserError(f"--{name} is not for the {model.robot}; its options: --{', --'.join(known)}")
     return evaluation(model, method, seed, **options)
+
+
+def _check_processes(robot: Robot) -> None:
+    if robot.course == "room" and jax.process_count() > 1:
+        raise UserError(f"the {robot.name} drives in PyBullet, which is one process's; start only one")
 
 
 def check_seed(seed: int) -> None:

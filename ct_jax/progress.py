@@ -13,13 +13,15 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.summary import scalar
 
+from ct_jax.devices import is_first
 from ct_jax.interrupts import raise_if_interrupted
 
 PLAIN_EVERY_S = 15.0  # where there is no terminal, a line this often
 
 
 class Bar:
-    """Progress of one stage on stderr: a live bar on a terminal, a line now and then elsewhere."""
+    """Progress of one stage on stderr: a live bar on a terminal, a line now and then elsewhere. Of several processes
+    the first one tells."""
 
     def __init__(self, name: str, total: int, *, console: Console | None = None):
         """
@@ -30,8 +32,8 @@ class Bar:
         self._begun = self._spoke = time.monotonic()
         self._first: int | None = None
         console = console or Console(stderr=True)
-        self._live = None
-        if console.is_terminal:
+        self._live, self._tells = None, is_first()
+        if console.is_terminal and self._tells:
             self._live = Progress(
                 TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                 TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console,
@@ -69,16 +71,21 @@ class Bar:
         return f", {left:.0f} s left"
 
     def _say(self, text: str) -> None:
-        print(f"{self.name}: {text}", file=sys.stderr, flush=True)
+        if self._tells:
+            print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
 
 class Metrics:
     """Scalars of a run, appended to ``metrics.jsonl`` and to TensorBoard's files in ``tensorboard/``.
 
-    Both are written at once: TensorBoard's usual writer has a thread of its own, and hangs when the disk is full.
+    Both are written at once: TensorBoard's usual writer has a thread of its own, and hangs when the disk is full. Of
+    several processes the first one writes.
     """
 
     def __init__(self, run: Path):
+        self._writes = is_first()
+        if not self._writes:
+            return
         file, board = run / "metrics.jsonl", run / "tensorboard"
         _drop_half_line(file)
         board.mkdir(exist_ok=True)
@@ -88,6 +95,8 @@ class Metrics:
 
     def log(self, stage: str, step: int, **values: float) -> None:
         """Log the scalars of a stage at a step. What is not finite is null: JSON knows no other way."""
+        if not self._writes:
+            return
         record: dict[str, str | float | None] = {"stage": stage, "step": step}
         record["time_s"] = round(time.monotonic() - self._begun, 3)
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
@@ -100,6 +109,8 @@ class Metrics:
 
     def close(self) -> None:
         """Close both files."""
+        if not self._writes:
+            return
         try:
             self._file.close()
         finally:

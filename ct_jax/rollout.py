@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import State
 from flax import struct
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv
 from ct_envs.maze import Maze
+from ct_jax.devices import sharded
 
 
 class Action(NamedTuple):
@@ -50,12 +52,19 @@ class Steps:
     collision: Float[Array, "T N"]
 
 
-@functools.partial(jax.jit, static_argnames=("env", "length"))
+@functools.partial(jax.jit, static_argnames=("env", "length", "mesh"))
 def rollout(
-    env: MazeEnv, policy: Policy, state: State, memory: Any, key: jax.Array, length: int
+    env: MazeEnv, policy: Policy, state: State, memory: Any, key: jax.Array, length: int, mesh: Mesh | None = None
 ) -> tuple[State, Any, Steps]:
-    """Step N environments ``length`` times (static). Environments without auto-reset stay where they finished."""
+    """Step N environments ``length`` times (static). Environments without auto-reset stay where they finished.
+
+    Args:
+        mesh: the devices that share the environments evenly. Which device steps one changes nothing of what happens.
+    """
     step = jax.vmap(env.step)
+    if mesh is not None:  # each device steps its own: XLA would not split the calls of MuJoCo by itself
+        spec = sharded(mesh).spec
+        step = jax.shard_map(step, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
     def once(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Steps]:
         state, memory = carry
@@ -75,6 +84,8 @@ def rollout(
         return (after, memory), record
 
     (state, memory), steps = jax.lax.scan(once, (state, memory), jax.random.split(key, length))
+    if mesh is not None:
+        steps = jax.lax.with_sharding_constraint(steps, sharded(mesh, axis=1))
     return state, memory, steps
 
 

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -28,7 +28,7 @@ import numpy as np
 from ct_envs import Maze, MazeEnv, UserError, load_maze, maze_names, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
 from ct_envs.robots import Robot, get_robot
-from ct_jax import __version__
+from ct_jax import __version__, devices
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.evaluate import Episodes
 from ct_jax.presets import Settings, to_dict
@@ -71,7 +71,7 @@ class Run:
     def done(self, stage: str) -> dict[str, Any] | None:
         """What the finished stage said of itself; None if it has not finished."""
         file = self.folder / stage / "done.json"
-        return read_json(file, mend=self.mend(stage)) if file.is_file() else None
+        return devices.first(lambda: read_json(file, mend=self.mend(stage)) if file.is_file() else None)
 
     @property
     def made(self) -> dict[str, Any]:
@@ -87,19 +87,28 @@ class Run:
     def stage(self, stage: str) -> Iterator[tuple[Path, dict[str, Any]]]:
         """A stage's folder, and a dict of what it says of itself, written last. ``wall_s`` sums over interruptions."""
         folder = self.folder / stage
-        folder.mkdir(exist_ok=True)
         file, begun = folder / "spent.json", time.perf_counter()
-        before = float(read_json(file).get("wall_s", 0.0)) if file.is_file() else 0.0
+
+        def begin() -> float:
+            folder.mkdir(exist_ok=True)
+            return float(read_json(file).get("wall_s", 0.0)) if file.is_file() else 0.0
+
+        before = devices.first(begin)
         info: dict[str, Any] = {}
         try:
             yield folder, info
         except BaseException:
             with suppress(OSError):
-                write_json(file, {"wall_s": round(before + time.perf_counter() - begun, 2)})
+                if devices.is_first():
+                    write_json(file, {"wall_s": round(before + time.perf_counter() - begun, 2)})
             raise
-        write_json(folder / "done.json", info | {"wall_s": round(before + time.perf_counter() - begun, 2)})
-        file.unlink(missing_ok=True)
-        drop_leftovers(folder)
+
+        def finish() -> None:
+            write_json(folder / "done.json", info | {"wall_s": round(before + time.perf_counter() - begun, 2)})
+            file.unlink(missing_ok=True)
+            drop_leftovers(folder)
+
+        devices.first(finish)
 
 
 # ------------------------------------------------------------------------------------------- trainings and results
@@ -134,11 +143,15 @@ def kept_row(
         head: what the row begins with.
     """
     file = folder / f"{slug(name)}-{method}.json"
-    if not file.is_file():
+    if not devices.first(file.is_file):
         episodes = measure()
-        _save_episodes(episodes_file(folder, name, method), episodes)
-        write_json(file, head | episodes.summary())
-    return read_json(file)
+
+        def keep() -> None:
+            _save_episodes(episodes_file(folder, name, method), episodes)
+            write_json(file, head | episodes.summary())
+
+        devices.first(keep)
+    return devices.first(lambda: read_json(file))
 
 
 def episodes_file(folder: Path, name: str, method: str) -> Path:
@@ -216,6 +229,24 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
         UserError: the folder cannot be made, is in use and ``resume`` is not given, or is another run's.
     """
     join_mazes(run.mazes, run.eval_mazes)
+    with ExitStack() as held:
+
+        def begin() -> None:
+            _make_folder(run, resume)
+            held.enter_context(_locked(run.folder))
+            config = run.folder / "config.json"
+            if not config.is_file():
+                write_json(config, identity(run) | provenance())
+            for stage in STAGES:  # a process may have been killed between a stage's end and its tidying up
+                if (run.folder / stage / "done.json").is_file():
+                    drop_leftovers(run.folder / stage)
+
+        devices.first(begin)
+        yield
+
+
+def _make_folder(run: Run, resume: bool) -> None:
+    """The checks and the folder of ``open_run``."""
     if run.folder.exists() and not run.folder.is_dir():
         raise UserError(f"{run.folder}: a file, not a folder; choose another with --out")
     config = run.folder / "config.json"
@@ -230,13 +261,6 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
     # What a process left that was killed before it wrote config.json does not count.
     if not config.is_file() and any(path.suffix not in (".lock", ".part") for path in run.folder.iterdir()):
         raise UserError(f"{run.folder}: not empty and no run folder; choose another with --out")
-    with _locked(run.folder):
-        if not config.is_file():
-            write_json(config, identity(run) | provenance())
-        for stage in STAGES:  # a process may have been killed between a stage's end and its tidying up
-            if run.done(stage) is not None:
-                drop_leftovers(run.folder / stage)
-        yield
 
 
 @contextmanager
@@ -326,9 +350,10 @@ def _commit() -> str:
 
 def hardware() -> str:
     """The devices in words."""
-    devices = jax.devices()
-    accelerators = "" if devices[0].platform == "cpu" else f"{len(devices)} x {devices[0].device_kind}, "
-    return f"{accelerators}{platform.machine()} CPU, {cores()} core{'s' * (cores() > 1)}"
+    found = jax.devices()
+    accelerators = "" if found[0].platform == "cpu" else f"{len(found)} x {found[0].device_kind}, "
+    hosts = f"{jax.process_count()} processes, each " if jax.process_count() > 1 else ""
+    return f"{accelerators}{hosts}{platform.machine()} CPU, {cores()} core{'s' * (cores() > 1)}"
 
 
 def cores() -> int:

@@ -19,6 +19,7 @@ from ct_envs import UserError
 from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
+from ct_jax import devices
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
@@ -108,12 +109,45 @@ def arrays_of(trajectories: Trajectories) -> dict[str, np.ndarray]:
 
 
 def save(trajectories: Trajectories, file: Path) -> None:
-    """Write to an ``.npz`` file (no pickle)."""
-    np.savez_compressed(file, **arrays_of(trajectories))  # pyright: ignore[reportArgumentType]
+    """Write to an ``.npz`` file (no pickle), of which a reader never sees half; several processes write one each."""
+    own = _names(file, jax.process_count())[jax.process_index()]
+    part = own.with_name(f"part-{own.name}")
+    np.savez_compressed(part, **arrays_of(trajectories))  # pyright: ignore[reportArgumentType]
+    part.replace(own)
+    devices.largest(0)  # nobody goes on before all are there
+
+
+def is_saved(file: Path) -> bool:
+    """Whether ``save`` has written all of it."""
+    return devices.first(lambda: bool(_found(file)))
 
 
 def load(file: Path) -> Trajectories:
-    """Read what ``save`` wrote. Raises UserError naming the file if it is damaged."""
+    """Read what ``save`` wrote: each process what it wrote itself, or, where their number is another, an even share.
+
+    Raises:
+        UserError: a file is damaged, which the error names.
+    """
+    files, n, i = _found(file) or [file], jax.process_count(), jax.process_index()
+    if len(files) == n:
+        return _load(files[i])
+    whole = concatenate([_load(each) for each in files])
+    return select(whole, np.arange(whole.n * i // n, whole.n * (i + 1) // n))
+
+
+def _names(file: Path, processes: int) -> list[Path]:
+    several = [file.with_name(f"{file.stem}.{i}-of-{processes}{file.suffix}") for i in range(processes)]
+    return [file] if processes == 1 else several
+
+
+def _found(file: Path) -> list[Path]:
+    """The files that some number of processes wrote; none if one is missing."""
+    counts = {int(part.stem.rpartition("-")[2]) for part in file.parent.glob(f"{file.stem}.0-of-*{file.suffix}")}
+    sets = [_names(file, n) for n in sorted({1} | counts)]
+    return next((files for files in sets if all(each.is_file() for each in files)), [])
+
+
+def _load(file: Path) -> Trajectories:
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as data:
             return Trajectories(**{name: data[name] for name in data.files})

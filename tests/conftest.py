@@ -194,7 +194,7 @@ def _know_tiny(patch: pytest.MonkeyPatch, settings) -> None:
 
     patch.setitem(robots.ROBOTS, "point", dataclasses.replace(robots.POINT, horizon=50))
     patch.setitem(presets.PRESETS, "tiny", settings)
-    patch.setattr(cli, "prepare_jax", lambda: None)
+    patch.setattr(cli, "prepare_jax", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

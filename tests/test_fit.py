@@ -1,8 +1,5 @@
 """Supervised training: it learns, it can be stopped and continued, and it is one program on any number of devices."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import jax
@@ -22,7 +19,7 @@ from ct_jax.fit import (
     transformer_loss,
     value_loss,
 )
-from ct_jax.trajectories import sample_windows, save
+from ct_jax.trajectories import sample_windows
 from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork
 
@@ -193,48 +190,6 @@ def test_no_trajectory_without_a_collision_is_an_error(toy_data):
     data = toy_data([5, 5])
     with pytest.raises(UserError, match="collision"):
         best_trajectories(data.replace(collision=1 + 0 * data.collision), ValueConfig(collision_free=True), np.inf)
-
-
-# ----------------------------------------------------------------------------------------------------------- devices
-
-ON_FOUR_DEVICES = """
-import sys
-from pathlib import Path
-import jax
-from ct_envs import POINT, load_maze, stack_mazes
-from ct_jax.fit import Fit, FitConfig, fit, init_params, value_loss
-from ct_jax.trajectories import load
-from ct_jax.value import ValueNetwork
-
-data, model, losses = load(Path(sys.argv[1])), ValueNetwork(8), []
-learner = Fit(value_loss(model), FitConfig(**eval(sys.argv[2])), 0.8, POINT)
-params = init_params(jax.random.key(0), model, data)
-assert len(learner.create(jax.random.key(0), params).update.sharding.device_set) == jax.device_count() == 4
-fit(
-    jax.random.key(0), learner, params, data, stack_mazes([load_maze("antmaze-umaze")]), chunk=2,
-    on_progress=lambda update, loss: losses.append(loss),
-)
-print(*losses)
-"""
-
-
-def test_four_devices_learn_the_same_as_one(data, tmp_path):
-    save(data, tmp_path / "data.npz")
-    config = {"updates": 6, "batch": 8, "steps": 2, "learning_rate": 1e-2, "warmup": 1}
-    environment = os.environ | {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
-        "JAX_PLATFORMS": "cpu",
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
-    command = [sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path / "data.npz"), repr(config)]
-    four = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
-    assert four.returncode == 0, four.stderr
-    model, one = ValueNetwork(8), []
-    learner = Fit(value_loss(model), FitConfig(**config), 0.8, POINT)
-    params = init_params(jax.random.key(0), model, data)
-    run(learner, params, data, on_progress=lambda update, loss: one.append(loss))
-    assert len(one) == 3 and one[-1] < one[0]
-    np.testing.assert_allclose([float(loss) for loss in four.stdout.split()], one, rtol=1e-5)
 
 
 def test_without_compilation(data):

@@ -36,7 +36,7 @@ def live(arguments, settings, folder, stage, operations, cache):
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
     presets.PRESETS["tiny"] = presets.TURTLEBOT3_PRESETS["tiny"] = settings
-    cli.prepare_jax = lambda: None
+    cli.prepare_jax = lambda *_: None
     jax.config.update("jax_compilation_cache_dir", cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     checkpoint.SAVE_EVERY_S = 0.0

@@ -59,7 +59,7 @@ class Trained:
 def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.TURTLEBOT3_PRESETS, "tiny", TINY)
-        patch.setattr(cli, "prepare_jax", lambda: None)
+        patch.setattr(cli, "prepare_jax", lambda *_: None)
         folder = str(tmp_path_factory.mktemp("runs") / "turtlebot3")
         arguments = ["train", "turtlebot3", "--preset", "tiny", "--out", folder]
         assert main(arguments) == 0

@@ -12,7 +12,6 @@ step, so ``reward_scale=0.1`` brings them there. The target entropy, -1 for each
 7, 6000 updates, one seed). ``reward_scale``, ``updates`` and ``imitation`` are reasoned, not tuned yet.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from ct_envs import Robot
@@ -29,7 +27,7 @@ from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
 from ct_jax.checkpoint import Checkpoints, run_to
-from ct_jax.fit import data_mesh
+from ct_jax.devices import data_mesh, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
 
 
@@ -118,7 +116,7 @@ class Cql:
         critics = jax.jit(self.critics.init)(critic_key, see, jnp.zeros((1, 1, self.action_size)))
         params = Learned(actor, critics, jnp.log(jnp.asarray(self.config.temperature, jnp.float32)))
         state = CqlState(params, critics, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
-        return jax.device_put(jax.tree.map(jnp.array, state), NamedSharding(self.mesh, PartitionSpec()))
+        return place(jax.tree.map(jnp.array, state), replicated(self.mesh))
 
     def policy(self, state: CqlState) -> ActorPolicy:
         """The policy learned so far."""
@@ -137,7 +135,7 @@ class Cql:
             draw, data, data.reward, mazes, batch=self.config.batch, steps=2, overhang=1, map_cell_m=self.map_cell_m,
             symmetries=self._symmetries,
         )  # fmt: skip
-        window = jax.lax.with_sharding_constraint(window, NamedSharding(self.mesh, PartitionSpec("data")))
+        window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
         batch = transitions(window, self.robot.goal_tolerance_m)
         gradient, info = jax.grad(self._loss, has_aux=True)(state.params, state, batch, noise)
         change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
@@ -229,8 +227,7 @@ def train_cql(
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, data)
-    place = functools.partial(jax.device_put, device=NamedSharding(learner.mesh, PartitionSpec()))
-    data, mazes = place(data), place(mazes)
+    data, mazes = place((data, mazes), replicated(learner.mesh))
     state = run_to(
         learner.config.updates, state, lambda state, n: learner.train(state, data, mazes, n),
         lambda state: int(state.update),

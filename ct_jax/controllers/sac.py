@@ -27,6 +27,7 @@ from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.frames import own_frame, symmetries, transform, turn
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
 from ct_jax.rollout import Action, Controller, act_as_meant, rollout
 
@@ -517,13 +518,14 @@ def train_controller(
         train_tasks = chain_tasks(train_tasks, seed)
     env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
     sac = Sac(env, config)
-    state = sac.create(train_key, maze, train_tasks)
+    state = alike(sac.create(train_key, maze, train_tasks))
     state = run_to(
         config.iterations, state, sac.train, lambda state: int(state.iteration),
         on_progress,
         checkpoints, chunk,
     )  # fmt: skip
-    act = SacController(state.normalizer, state.average, env.action_size, config.hidden, config.frame, config.effort)
+    normalizer, average = jax.tree.map(jnp.asarray, jax.device_get((state.normalizer, state.average)))
+    act = SacController(normalizer, average, env.action_size, config.hidden, config.frame, config.effort)
     alone, in_a_row = (
         env_factory(maps=False, horizon=config.episode_steps, auto_reset=again) for again in (False, True)
     )

@@ -1,0 +1,163 @@
+"""Several devices and several processes: the one mesh, what lies where on it, and what processes tell each other.
+
+Every process runs the same program on the whole mesh. What is sharded lies along its one axis, "data", in the order of
+the processes; everything else every process has whole. Files are process 0's, and so are decisions that depend on
+files, clocks or signals: processes that decided apart would wait for each other for ever.
+
+With one process all of this is the identity.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from ct_envs import UserError
+from ct_jax import interrupts
+
+Tree = TypeVar("Tree")
+T = TypeVar("T")
+AXIS = "data"
+
+
+def start(coordinator: str | None, processes: int | None, process: int | None) -> None:
+    """Join the other processes; before anything else asks JAX for its devices.
+
+    Args:
+        coordinator: HOST:PORT of process 0; with None, JAX finds it, and the rest, by its own cluster detection.
+
+    Raises:
+        UserError: no cluster is found, or the other processes are not.
+    """
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (ValueError, RuntimeError) as bad:
+        where = f"{coordinator}: process {process} of {processes} cannot join" if coordinator else "no cluster is found"
+        mend = "" if coordinator else "; name it with --coordinator HOST:PORT --processes N --process I"
+        raise UserError(f"{where} ({' '.join(str(bad).split())[:200]}){mend}") from None
+    interrupts.obey_together(largest)
+
+
+def is_first() -> bool:
+    """Whether this is process 0, which speaks and writes for all."""
+    return jax.process_index() == 0
+
+
+# ------------------------------------------------------------------------------------------------- what lies where
+
+
+def data_mesh(batch: int | None = None) -> Mesh:
+    """All devices along one axis, "data", process after process; or, equally many of each process, as many as share a
+    batch evenly.
+
+    Raises:
+        UserError: the processes cannot share the batch.
+    """
+    devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+    count = Counter(device.process_index for device in devices)
+    each = min(count.values())
+    if batch is not None:
+        if batch % len(count):
+            raise UserError(f"a batch of {batch} cannot be shared by {len(count)} processes; start a number that can")
+        each = max(n for n in range(1, each + 1) if batch % (n * len(count)) == 0)
+    first = np.cumsum([0, *count.values()])[:-1]
+    return Mesh(np.array([devices[i + j] for i in first for j in range(each)]), (AXIS,))
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """The same on every device."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def sharded(mesh: Mesh, axis: int = 0) -> NamedSharding:
+    """Split along an axis of the arrays."""
+    return NamedSharding(mesh, PartitionSpec(*[None] * axis, AXIS))
+
+
+def place(tree: Tree, sharding: NamedSharding) -> Tree:
+    """Put arrays, which every process has whole, onto the mesh."""
+
+    def put(leaf: Any) -> jax.Array:
+        if sharding.is_fully_addressable:
+            return jax.device_put(leaf, sharding)
+        if isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(leaf)))
+        whole = np.asarray(leaf)
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+
+    return jax.tree.map(put, tree)
+
+
+def feed(tree: Tree, mesh: Mesh) -> Tree:
+    """Put the rows that each process has of arrays onto its own devices; all processes have equally many."""
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharded(mesh), leaf), tree)
+
+
+def alike(state: Tree) -> Tree:
+    """A state that every process computes for itself, in the form in which several processes save one state."""
+    if jax.process_count() == 1:
+        return state
+    return place(state, replicated(data_mesh(jax.process_count())))
+
+
+def fill_up(n: int, mesh: Mesh) -> np.ndarray:
+    """Indices of n things, the last one repeated until the devices share them evenly."""
+    return np.minimum(np.arange(-(-n // mesh.size) * mesh.size), n - 1)
+
+
+def own(tree: Tree, mesh: Mesh, axis: int = 0) -> Tree:
+    """Of arrays that are sharded along an axis the part on this process's devices, as NumPy."""
+    if jax.process_count() > 1:
+        tree = jax.jit(lambda tree: tree, out_shardings=sharded(mesh, axis))(tree)  # if it is not already
+        tree = multihost_utils.global_array_to_host_local_array(tree, mesh, sharded(mesh, axis).spec)
+    return jax.tree.map(np.asarray, tree)
+
+
+def own_rows(rows: np.ndarray) -> np.ndarray:
+    """This process's part of rows that every process has whole and that they share evenly."""
+    return np.split(rows, jax.process_count())[jax.process_index()]
+
+
+# ------------------------------------------------------------------------------------ what processes tell each other
+
+
+def joined(rows: np.ndarray) -> np.ndarray:
+    """All processes' rows, one process after the other; each may have its own number of them."""
+    if jax.process_count() == 1:
+        return rows
+    own_bytes = np.frombuffer(np.ascontiguousarray(rows).tobytes(), np.uint8)  # JAX would make 32 bits of 64
+    counts = multihost_utils.process_allgather(np.asarray(len(own_bytes), np.uint32))
+    found = multihost_utils.process_allgather(np.pad(own_bytes, (0, counts.max() - len(own_bytes))))
+    every_byte = b"".join(part[:n].tobytes() for part, n in zip(found, counts, strict=True))
+    return np.frombuffer(every_byte, rows.dtype).reshape(-1, *rows.shape[1:])
+
+
+def largest(number: int) -> int:
+    """The largest of the numbers that the processes name."""
+    return int(joined(np.array([number])).max())
+
+
+def first(action: Callable[[], T]) -> T:
+    """What process 0 makes of an action that the others leave to it; JSON.
+
+    Raises:
+        UserError: in every process, what the action raised in process 0.
+    """
+    if jax.process_count() == 1:
+        return action()
+    said: dict[str, Any] = {}
+    if is_first():
+        try:
+            said = {"value": action()}
+        except (ValueError, OSError) as bad:
+            said = {"error": str(bad)}
+    text = joined(np.frombuffer(json.dumps(said).encode() if is_first() else b"", np.uint8))
+    said = json.loads(text.tobytes())
+    if "error" in said:
+        raise UserError(said["error"])
+    return said["value"]

@@ -1,0 +1,146 @@
+"""Several devices and several processes, for real: the same losses, checkpoints and episodes as on one device."""
+
+import fcntl
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from ct_envs import UserError
+from ct_jax import devices
+from ct_jax.trajectories import is_saved, load, save
+
+pytestmark = pytest.mark.slow  # on two cores a minute
+PROGRAM = Path(__file__).with_name("on_devices.py")
+
+
+def begin(*arguments: str, host_devices: int = 1) -> subprocess.Popen:
+    environment = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={host_devices}", "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(sys.path), "TF_CPP_MIN_LOG_LEVEL": "3",
+    }  # fmt: skip
+    command = [sys.executable, str(PROGRAM), *arguments]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(*processes: subprocess.Popen, timeout_s: float = 300.0) -> None:
+    """Wait for all of them; none is left behind, whatever happens."""
+    try:
+        said = [process.communicate(timeout=timeout_s)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert all(process.returncode == 0 for process in processes), said
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("localhost", 0))
+        return found.getsockname()[1]
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory, toy_data):
+    """What came of one device, of four in one process, and of two processes, by name; once for all test workers."""
+    ours = tmp_path_factory.getbasetemp()
+    folder = (ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours) / "devices"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "two.npz").is_file():
+            save(toy_data([9, 17, 20, 12, 5], seed=1), folder / "data.npz")
+            finish(begin(str(folder), "one"))
+            finish(begin(str(folder), "four", host_devices=4))
+            address = f"localhost:{free_port()}"
+            finish(*(begin(str(folder), "two", address, "2", str(i)) for i in range(2)))
+    return {name: dict(np.load(folder / f"{name}.npz")) for name in ("one", "four", "two")}
+
+
+def test_each_ran_on_its_number_of_devices(runs):
+    assert [int(runs[name]["devices"]) for name in ("one", "four", "two")] == [1, 4, 2]
+
+
+@pytest.mark.parametrize("name", ["four", "two"])
+def test_the_loss_is_that_of_one_device(runs, name):
+    one, several = runs["one"]["losses"], runs[name]["losses"]
+    assert len(one) == 20 and len(set(one)) == 20
+    np.testing.assert_allclose(several, one, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "saved"), [("one", "one"), ("four", "one"), ("two", "one"), ("two", "four")])
+def test_training_goes_on_from_any_number_of_devices(runs, name, saved):
+    found = runs[name][f"from-{saved}"]
+    assert len(found) == 10
+    np.testing.assert_allclose(found, runs["one"]["losses"][10:], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["four", "two"])
+def test_no_device_is_sent_more_of_the_data_than_their_lengths(runs, name):
+    """Of all that a device holds a share of, it is sent only the steps that were drawn."""
+    sent, rows, table = (int(runs[name][what]) for what in ("sent", "rows", "table"))
+    assert 0 < sent <= rows < table
+
+
+def by_goal(run) -> tuple[np.ndarray, ...]:
+    """Collected trajectories, in an order that does not depend on which process collected them."""
+    order = np.lexsort(run["goal"].T)
+    return tuple(run[name][order] for name in ("goal", "length", "collected"))
+
+
+@pytest.mark.parametrize("name", ["four", "two"])
+def test_the_same_trajectories_are_collected(runs, name):
+    for several, one in zip(by_goal(runs[name]), by_goal(runs["one"]), strict=True):
+        np.testing.assert_allclose(several, one, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["four", "two"])
+def test_the_same_episodes_are_evaluated(runs, name):
+    parts = [part for part in runs["one"] if part.startswith("evaluated")]
+    assert runs["one"]["evaluated-path"].shape == (20, 5, 2) and len(parts) == 6
+    for part in parts:
+        np.testing.assert_allclose(runs[name][part], runs["one"][part], rtol=1e-4, atol=1e-5, err_msg=part)
+
+
+# --------------------------------------------------------------------------------------------- and without others
+
+
+@pytest.mark.parametrize("n", [1, 5, 8])
+def test_filling_up_repeats_the_last(n):
+    order = devices.fill_up(n, devices.data_mesh())
+    assert len(order) % jax.device_count() == 0
+    assert order[:n].tolist() == list(range(n)) and set(order[n:]) <= {n - 1}
+
+
+def test_what_several_processes_wrote_is_shared_evenly(tmp_path, toy_data, monkeypatch):
+    parts, file = [toy_data([3, 4], seed=1), toy_data([5, 6, 7], seed=2)], tmp_path / "data.npz"
+    monkeypatch.setattr(devices, "joined", lambda rows: rows)
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    for i, part in enumerate(parts):
+        assert not is_saved(file)
+        monkeypatch.setattr(jax, "process_index", lambda i=i: i)
+        monkeypatch.setattr(devices, "first", lambda action: action())
+        save(part, file)
+    assert is_saved(file) and load(file).length.tolist() == [5, 6, 7]
+    found = []
+    monkeypatch.setattr(jax, "process_count", lambda: 3)
+    for i in range(3):
+        monkeypatch.setattr(jax, "process_index", lambda i=i: i)
+        found.append(load(file).length.tolist())
+    assert [n for share in found for n in share] == [3, 4, 5, 6, 7] and max(map(len, found)) == 2
+
+
+def test_processes_that_cannot_share_a_batch_are_told(monkeypatch):
+    class Device:
+        def __init__(self, process: int):
+            self.process_index, self.id = process, process
+
+    monkeypatch.setattr(jax, "devices", lambda: [Device(i) for i in range(3)])
+    with pytest.raises(UserError, match="a batch of 4 cannot be shared by 3 processes"):
+        devices.data_mesh(4)
+    assert devices.data_mesh(6).size == 3
