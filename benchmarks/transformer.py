@@ -8,6 +8,22 @@ AdamW. The peer is Hugging Face's Decision Transformer in torch (same widths, ba
 batch that lies ready. The third contestant is a matrix product: the ratio is the share of its FLOP/s that our step
 reaches, counting XLA's count for one gradient of the loss without the drawing of windows.
 On a GPU the same in bfloat16 and with cuDNN's attention.
+
+Last results:
+
+2026-11-24, commit d6b286a, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
+gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
+
+
+| what                | median (min-max)    | unit    | against                | its   | times (min-max)  | asked |
+|---------------------|---------------------|---------|------------------------|-------|------------------|-------|
+| turtlebot3, float32 | 9.98 (8.39-10.4)    | steps/s | float32 matrix product | 19.9  | 0.50 (0.44-0.50) |       |
+| turtlebot3, float32 | 9.98 (8.39-10.4)    | steps/s | Hugging Face, torch    | 8.19  | 1.22 (1.03-1.27) | 1.2   |
+| turtlebot3, float32 | 93.8 (78.9-98.1)    | GFLOP/s |                        |       |                  |       |
+| ant, float32        | 0.152 (0.151-0.153) | steps/s | float32 matrix product | 0.245 | 0.62 (0.58-0.66) |       |
+| ant, float32        | 0.152 (0.151-0.153) | steps/s | Hugging Face, torch    | 0.191 | 0.80 (0.78-0.81) | 1.2   |
+| ant, float32        | 104 (104-105)       | GFLOP/s |                        |       |                  |       |
 """
 
 from dataclasses import dataclass
