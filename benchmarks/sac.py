@@ -7,6 +7,26 @@ The peer is Stable-Baselines3's SAC (torch) on the same environments: ours, comp
 our setting (64 environments, 8 updates a step). Both are timed with all they do besides: stepping, storing, drawing.
 An episode that times out ends for the peer as one that fails: ours go on by themselves, and their last observation is
 not kept. With --full the peer, too, learns until it walks 90 % of the edges.
+
+Last results:
+
+2026-11-24, commit d6b286a, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
+gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
+
+
+| what                        | median (min-max) | unit      | against           | its  | times (min-max)  | asked |
+|-----------------------------|------------------|-----------|-------------------|------|------------------|-------|
+| point, 1 environments, 1    | 210 (194-236)    | updates/s | Stable-Baselines3 | 83.8 | 2.60 (2.31-3.02) | 2.5   |
+| updates a step              |                  |           |                   |      |                  |       |
+| point, 64 environments, 8   | 202 (184-220)    | updates/s | Stable-Baselines3 | 89.4 | 2.12 (1.85-2.70) | 5     |
+| updates a step              |                  |           |                   |      |                  |       |
+| ant, 1 environments, 1      | 173 (151-188)    | updates/s | Stable-Baselines3 | 77.5 | 2.22 (2.04-2.53) | 2.5   |
+| updates a step              |                  |           |                   |      |                  |       |
+| ant, 64 environments, 8     | 179 (172-181)    | updates/s | Stable-Baselines3 | 96.7 | 1.85 (1.78-1.94) | 5     |
+| updates a step              |                  |           |                   |      |                  |       |
+| point: until 90 % of the    | 1.62 (1.62-1.62) | s         |                   |      |                  |       |
+| edges are walked            |                  |           |                   |      |                  |       |
 """
 
 import time

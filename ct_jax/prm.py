@@ -167,7 +167,7 @@ def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     first, second = pairs.T
     clear = roadmap.radius_m + roadmap.config.margin_m * (np.maximum(first, second) < roadmap.config.samples)
     free = as_space(roadmap.maze).segment_free(points.take(first, 0), points.take(second, 0), clear)
-    return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs[free]]))
+    return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs.take(np.flatnonzero(free), 0)]))
 
 
 def _new_pairs(points: np.ndarray, known: int, reach_m: float) -> np.ndarray:
@@ -198,12 +198,13 @@ class MazeSpace:
 
     def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """As ``Space`` says."""
-        ends, radius = np.stack([a, b], 1).astype(np.float32), np.asarray(radius, np.float32)
+        ends, radius = np.asarray(np.stack([a, b], 1), np.float32), np.asarray(radius, np.float32)
         free, unclear = _in_blocks(functools.partial(_by_cells, self.maze), ends, radius)
-        ends, radius = ends[unclear], radius[unclear]
+        which = np.flatnonzero(unclear)
+        ends, radius = ends.take(which, 0), radius.take(which)
         longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).max(initial=0.0))
         reach = segment_reach(longest, float(radius.max(initial=0.0)), float(self.maze.cell_m))
-        (free[unclear],) = _in_blocks(functools.partial(_segments_free, self.maze, reach=reach), ends, radius)
+        (free[which],) = _in_blocks(functools.partial(_segments_free, self.maze, reach=reach), ends, radius)
         return free
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
@@ -218,10 +219,11 @@ def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, ra
     """What a compiled check says of edges, ends [m, 2, 2] (m) and radii [m] (m): one or more bool [m]."""
     found = []
     for begin in range(0, max(len(ends), 1), _BLOCK):
-        n = min(len(ends) - begin, _BLOCK)
-        size = max(1024, 1 << (n - 1).bit_length())  # powers of two, so that few programs serve all roadmaps
-        block, room = np.zeros((size, 2, 2), np.float32), np.zeros(size, np.float32)
-        block[:n], room[:n] = ends[begin : begin + n], radius[begin : begin + n]
+        block, room = ends[begin : begin + _BLOCK], radius[begin : begin + _BLOCK]
+        n = len(block)
+        more = max(1024, 1 << (n - 1).bit_length()) - n  # to a power of two, so that few programs serve all roadmaps
+        if more:
+            block, room = np.pad(block, ((0, more), (0, 0), (0, 0))), np.pad(room, (0, more))
         found.append([(flag, n) for flag in check(ends=block, radius=room)])
     return [np.concatenate([np.asarray(flag)[:n] for flag, n in flags]) for flags in zip(*found, strict=True)]
 
