@@ -6,6 +6,39 @@ Against two peers on the same maze. *Python loop* is the same roadmap as one wou
 over pairs of points, over the wall cells near each, and over the goals of the table. *OMPL* is its PRM with the
 number of samples and of neighbours that ours has on average, states checked by a Python function, as PyPI's package
 has it; it samples its edges every 0.1 m, where ours are exact, and has no table.
+
+Last results:
+
+2026-11-24, commit 51962a0, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
+gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
+
+
+| what                        | median (min-max)    | unit | against        | its    | times (min-max)     | asked |
+|-----------------------------|---------------------|------|----------------|--------|---------------------|-------|
+| 100 samples: build          | 3.85 (2.92-5.17)    | ms   | OMPL           | 8.74   | 2.36 (1.50-2.79)    |       |
+| 100 samples: build          | 2.28 (1.77-9.6)     | ms   | Python loop    | 6.04   | 2.53 (0.62-3.73)    |       |
+| 100 samples: build and      | 4.38 (3.94-4.89)    | ms   | Python loop    | 38.2   | 8.75 (7.83-9.57)    |       |
+| table                       |                     |      |                |        |                     |       |
+| 100 samples: a plan         | 1.63 (1.43-2.23)    | ms   | Python loop    | 0.449  | 0.31 (0.22-0.32)    |       |
+| 100 samples: a plan         | 1.63 (1.43-2.23)    | ms   | OMPL           | 3.86   | 2.37 (1.82-3.75)    |       |
+| 200 samples: build          | 2.81 (2.43-3.29)    | ms   | OMPL           | 32.9   | 12.32 (9.98-13.57)  |       |
+| 200 samples: build          | 2.79 (2.53-3.01)    | ms   | Python loop    | 20.8   | 7.29 (6.66-8.30)    |       |
+| 200 samples: build and      | 10.5 (9.84-12.4)    | ms   | Python loop    | 209    | 19.92 (16.83-21.42) |       |
+| table                       |                     |      |                |        |                     |       |
+| 200 samples: a plan         | 1.65 (1.59-1.73)    | ms   | Python loop    | 0.955  | 0.58 (0.56-0.60)    |       |
+| 200 samples: a plan         | 1.65 (1.59-1.73)    | ms   | OMPL           | 4.03   | 2.43 (2.27-3.62)    |       |
+| 1000 samples: build         | 13.4 (11.2-14.3)    | ms   | OMPL           | 515    | 39.41 (35.98-45.95) | 2     |
+| 1000 samples: build         | 12.5 (9.35-18.5)    | ms   | Python loop    | 529    | 43.44 (28.40-67.97) | 50    |
+| 1000 samples: build and     | 505 (463-513)       | ms   |                |        |                     |       |
+| table                       |                     |      |                |        |                     |       |
+| 1000 samples: a plan        | 7.86 (7.74-8.22)    | ms   | Python loop    | 18.5   | 2.33 (2.24-2.51)    |       |
+| 1000 samples: a plan        | 7.86 (7.74-8.22)    | ms   | OMPL           | 4.81   | 0.61 (0.56-0.62)    |       |
+| 5000 samples: build         | 637 (532-742)       | ms   | OMPL           | 12,055 | 19.46 (16.27-22.64) |       |
+| 5000 samples: a plan        | 191 (187-195)       | ms   | Python loop    | 587    | 3.08 (2.80-3.35)    |       |
+| 5000 samples: a plan        | 191 (187-195)       | ms   | OMPL           | 331    | 1.73 (1.63-1.83)    |       |
+| growth: an edge at 5000     | 0.144 (0.129-0.176) | µs   | an edge at 200 | 1.26   | 8.65 (7.29-11.09)   | 0.769 |
+| samples                     |                     |      |                |        |                     |       |
 """
 
 import math
