@@ -13,9 +13,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
 
 import _harness
 import prm as prm_benchmark
+import scale
 from _harness import LAST, Contestant, Options, Results, about, has_peer, table_of, time_together, with_table
 
-from ct_envs import load_maze
+from ct_envs import UserError, load_maze
 from ct_jax.prm import Path
 
 BENCHMARKS = pathlib.Path(_harness.__file__).parent
@@ -130,3 +131,60 @@ def test_the_python_loop_builds_the_same_roadmap():
         else:
             assert not path
     assert found > 2 and "start" not in graph
+
+
+# -------------------------------------------------------------------------------------------- the dry run on paper
+
+
+def scale_options(tmp_path, **rows: float) -> scale.ScaleOptions:
+    """Options whose results hold the named rows alone, as if of two cores."""
+    names = {
+        "collected": ("rollout", "point, collection guided by explorer", "trajectories/s"),
+        "roadmap": ("prm", "200 samples: build and table", "ms"),
+        "updates": ("transformer", "point, float32", "steps/s"),
+        "flop": ("transformer", "point, float32", "GFLOP/s"),
+    }
+    made = {"hardware": "x86_64 CPU, 2 cores", "commit": "0"}
+    by_file: dict[str, list] = {}
+    for which, value in rows.items():
+        file, name, unit = names[which]
+        by_file.setdefault(file, []).append({"name": name, "unit": unit, "value": value, "made": made})
+    for file, content in by_file.items():
+        (tmp_path / f"{file}.json").write_text(json.dumps(content))
+    return scale.ScaleOptions(robot="point", preset="demo", results=tmp_path, page=tmp_path / "scale.md")
+
+
+MEASURED = {"collected": 10.0, "roadmap": 20.0, "updates": 2.0, "flop": 100.0}
+SIZES = scale.Sizes(trajectory=10_000, step=20, parameters=10**6, state=3 * 10**6, temporary=10**8, messages=10)
+
+
+@pytest.mark.parametrize("missing", MEASURED)
+def test_a_figure_that_is_missing_names_its_benchmark(tmp_path, missing):
+    options = scale_options(tmp_path, **{name: value for name, value in MEASURED.items() if name != missing})
+    with pytest.raises(UserError, match=r"has no row '.*' in .*; run: python benchmarks/\w+\.py$"):
+        scale.main(options)
+    assert not options.page.exists()
+
+
+def test_the_page_is_computed_from_what_was_measured(tmp_path):
+    options = scale_options(tmp_path, **MEASURED)
+    scale.main(options)
+    page = options.page.read_text()
+    assert "| point, collection guided by explorer | 10 trajectories/s | x86_64 CPU, 2 cores, commit 0 |" in page
+    assert page.count("| memory of a GPU |") == 3 and "## What breaks first" in page and "nan" not in page
+
+
+def test_more_hosts_hold_less_and_say_more(tmp_path):
+    """Memory and computation shrink as hosts grow, traffic does not, and what is on every process stays."""
+    options = scale_options(tmp_path, **MEASURED)
+    settings, assumed = scale.get_preset("paper", "point"), scale.Assumed()
+    found = scale.measured(options, settings.prm.samples)
+    one, two, many = (scale.plan(n, options, settings, found, SIZES, assumed) for n in (1, 2, 64))
+    assert one.used == assumed.gpus and many.used == settings.fit.batch
+    for smaller, larger in ((two, one), (many, two)):
+        assert smaller.gpu < larger.gpu and smaller.host < larger.host and smaller.compute < larger.compute
+        assert smaller.rollouts < larger.rollouts and smaller.roadmaps == larger.roadmaps
+        assert smaller.traffic > larger.traffic
+    assert one.rollouts == pytest.approx(options.trajectories / (10.0 / 2 * assumed.cores))
+    loads = [limit.load for limit in scale.limits(many, options, settings, assumed)]
+    assert loads == sorted(loads, reverse=True)

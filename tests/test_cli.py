@@ -351,3 +351,22 @@ def test_a_closed_pipe_is_no_error():
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("command", [["train", "point"], ["evaluate", "zoo:point"]])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--coordinator x:1", "go together"),
+        ("--processes 2 --process 0", "go together"),
+        ("--coordinator x --processes 2 --process 0", "--coordinator x: give HOST:PORT"),
+        ("--coordinator x:port --processes 2 --process 0", "--coordinator x:port: give HOST:PORT"),
+        ("--coordinator x:1 --processes 2 --process 2", "--process 2: give a number from 0 to 1"),
+        ("--coordinator x:1 --processes 0 --process 0", "--processes 0: give 1 or more"),
+        ("--cluster --process 0", "leave out --coordinator"),
+    ],
+)
+def test_a_process_that_does_not_know_itself_is_told_in_one_line(capsys, command, options, said):
+    assert main([*command, *options.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and said in error and error.count("\n") == 1
