@@ -149,7 +149,9 @@ def weigh(robot: str, settings: Settings) -> Sizes:
         parameters=weight(params),
         state=weight((state.params, state.optimizer)),
         temporary=memory.temp_size_in_bytes * learner.mesh.size,
-        messages=len(re.findall(r"= .* (?:all-\w+|reduce-scatter|collective-permute)(?:-start)?\(", program.as_text())),
+        messages=len(
+            re.findall(r"= .* (?:all-\w+|reduce-scatter|collective-permute)(?:-start)?\(", str(program.as_text()))
+        ),
     )
 
 
