@@ -34,6 +34,7 @@ def start(coordinator: str | None, processes: int | None, process: int | None) -
     Raises:
         UserError: no cluster is found, or the other processes are not.
     """
+    jax.config.update("jax_enable_preemption_service", False)  # its handler of SIGTERM would take the place of ours
     try:
         jax.distributed.initialize(coordinator, processes, process)
     except (ValueError, RuntimeError) as bad:

@@ -6,7 +6,9 @@ From FOLDER/data.npz it trains, saves and goes on; it collects and evaluates; FO
 """
 
 import contextlib
+import os
 import re
+import signal
 import sys
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from ct_jax.checkpoint import Checkpoints
 from ct_jax.collect import CollectConfig, collect
 from ct_jax.evaluate import Pairs, evaluate
 from ct_jax.fit import Fit, FitConfig, fit, init_params, spread, transformer_loss
+from ct_jax.interrupts import interruptible, raise_if_interrupted
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.trajectories import Trajectories, load
@@ -28,6 +31,8 @@ from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork
 
 FOLDER, NAME = Path(sys.argv[1]), sys.argv[2]
+signals = contextlib.ExitStack()
+signals.enter_context(interruptible())  # before the processes meet, as the command line does
 if among := sys.argv[3:]:  # before anything asks JAX for its devices
     devices.start(among[0], int(among[1]), int(among[2]))
 
@@ -66,7 +71,9 @@ def empty(n: int, steps: int) -> Trajectories:
 
 
 def train() -> dict[str, np.ndarray]:
-    """Losses of all updates, and of the second half again, from all checkpoints of the first half that are there."""
+    """Losses of the first half of the updates, after which a signal comes (to the last of several processes); of all
+    of them; and of the second half again, from the checkpoints of all whom the signal stopped.
+    """
     data, (made, params) = load(FOLDER / "data.npz"), learner()
 
     def losses(checkpoints: Path, stop: int = UPDATES) -> np.ndarray:
@@ -75,7 +82,9 @@ def train() -> dict[str, np.ndarray]:
         def on_progress(update: int, loss: float) -> None:
             found.append(loss)
             if update == stop < UPDATES:
-                raise KeyboardInterrupt  # which saves
+                if jax.process_index() == jax.process_count() - 1:
+                    os.kill(os.getpid(), signal.SIGTERM)
+                raise_if_interrupted()  # as a bar does
 
         with contextlib.suppress(KeyboardInterrupt), contextlib.closing(Checkpoints(checkpoints)) as manager:
             fit(
@@ -83,8 +92,9 @@ def train() -> dict[str, np.ndarray]:
             )  # fmt: skip
         return np.array(found)
 
-    result = {"losses": losses(FOLDER / f"none-{NAME}")}
-    result["half"] = losses(FOLDER / "checkpoints" / NAME, stop=UPDATES // 2)
+    result = {"half": losses(FOLDER / "checkpoints" / NAME, stop=UPDATES // 2)}
+    signals.close()  # or the thread that watches for a program that does not stop would end this one
+    result["losses"] = losses(FOLDER / f"none-{NAME}")
     return result | {f"from-{saved.name}": losses(saved) for saved in sorted((FOLDER / "checkpoints").iterdir())}
 
 

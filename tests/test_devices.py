@@ -73,6 +73,11 @@ def test_the_loss_is_that_of_one_device(runs, name):
     np.testing.assert_allclose(several, one, rtol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["one", "four", "two"])
+def test_a_signal_to_one_process_stops_all_where_they_can_go_on(runs, name):
+    np.testing.assert_allclose(runs[name]["half"], runs["one"]["losses"][:10], rtol=1e-5)
+
+
 @pytest.mark.parametrize(("name", "saved"), [("one", "one"), ("four", "one"), ("two", "one"), ("two", "four")])
 def test_training_goes_on_from_any_number_of_devices(runs, name, saved):
     found = runs[name][f"from-{saved}"]
