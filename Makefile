@@ -54,7 +54,7 @@ format: setup ## Format the code and mend what the linter can mend
 	@$(BIN)/ruff check --fix-only .
 	@$(BIN)/ruff format .
 
-bench: setup ## Run every benchmark (10 min on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
+bench: setup ## Run every benchmark (a quarter of an hour on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
 	@for script in $(filter-out benchmarks/scale.py,$(sort $(wildcard benchmarks/[a-z]*.py))) benchmarks/scale.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
 # pip-tools lives in an environment of its own, so that it can neither be locked nor disturb what is.

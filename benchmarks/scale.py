@@ -25,7 +25,7 @@ from ct_envs import UserError, load_maze, stack_mazes
 from ct_envs.robots import get_robot
 from ct_jax.cli import guarded
 from ct_jax.devices import replicated, sharded
-from ct_jax.fit import Fit, FitState, transformer_loss
+from ct_jax.fit import Fit, transformer_loss
 from ct_jax.model import sizes
 from ct_jax.presets import Settings, get_preset
 from ct_jax.trajectories import Trajectories
@@ -133,7 +133,7 @@ def weigh(robot: str, settings: Settings) -> Sizes:
     data = abstract(robot, SMALL, steps)
     rtg = jax.ShapeDtypeStruct((SMALL, steps), jnp.float32)
     params = jax.eval_shape(model.init, jax.random.key(0), *sample_inputs(*sizes(robot)))
-    state = jax.eval_shape(lambda params: learner_state(learner, params), params)
+    state = jax.eval_shape(learner.create, jax.random.key(0), params)
     put = lambda tree, where: jax.tree.map(  # noqa: E731
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), tree
     )
@@ -153,11 +153,6 @@ def weigh(robot: str, settings: Settings) -> Sizes:
             re.findall(r"= .* (?:all-\w+|reduce-scatter|collective-permute)(?:-start)?\(", str(program.as_text()))
         ),
     )
-
-
-def learner_state(learner: Fit, params: Any) -> Any:
-    """The state before training."""
-    return FitState(params, learner.optimizer.init(params), jax.random.key(0), jnp.zeros((), jnp.int32))
 
 
 def abstract(robot: str, n: int, steps: int) -> Trajectories:
