@@ -21,6 +21,7 @@ from ct_jax.baselines.sac_alone import EDGES_ONLY, train_sac_alone
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
+from ct_jax.evaluate import GUIDED
 from ct_jax.mazes import evaluated
 from ct_jax.presets import Settings, get_preset
 from ct_jax.progress import Metrics
@@ -32,11 +33,11 @@ from ct_jax.run import (
     join_mazes,
     load_mazes,
     open_run,
-    provenance,
     training,
 )
 
 RESULTS = Path(__file__).parent / "results"
+SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,12 @@ def experiment(robot: str, about: str | None) -> int:
         options = tyro.cli(Options, description=about)
         plan = plan_for(robot, options.preset, controller=options.controller, variants=options.variants)
         out = options.out or Path("runs") / robot
-        rows = run_plan(robot, plan, preset=options.preset, seeds=options.seeds, out=out, engine=options.engine)
-        results = {"command": provenance()["command"], "rows": rows}
-        _write_results(RESULTS / f"{robot}-{options.preset}.json", results)
+        file = RESULTS / f"{robot}-{options.preset}.json"
+        run_plan(
+            robot, plan, preset=options.preset, seeds=options.seeds, out=out, engine=options.engine,
+            keep=lambda rows: write_results(file, {"rows": rows}),
+        )  # fmt: skip
+        show_results(file)
 
     return guarded(run)
 
@@ -131,17 +135,21 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
 
 
 def run_plan(
-    robot: str, plan: Plan, *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto"
-) -> list[dict[str, Any]]:
+    robot: str, plan: Plan, *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto",
+    keep: Callable[[list[dict[str, Any]]], None] = lambda rows: None,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Train and evaluate everything with each seed, continuing what is there; returns all rows.
 
     The references, planner and explorer, are the same in every run and appear once.
+
+    Args:
+        keep: told all rows so far after each model.
     """
     prepare_jax()
     seen, unseen = default_mazes(robot)
-    rows = []
+    rows: list[dict[str, Any]] = []
+    before: list[Run] = []
     for seed in seeds:
-        before: list[Run] = []
         for place, (name, settings) in enumerate(plan.variants.items()):
             run = Run(
                 folder=out / f"{name}-{seed}", robot=robot, preset=preset, settings=settings,
@@ -151,30 +159,42 @@ def run_plan(
             for other in before:
                 share(other, run)
             pipeline.train(run, resume=True)
-            before.append(run)
             found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
             if place == 0 and plan.baselines is not None:
                 found += run_baselines(run, plan.baselines)
-            if place or seed != seeds[0]:
-                found = [row for row in found if row["method"] not in ("planner", "explorer")]
+            if before:
+                found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
+            before.append(run)
+            keep(rows)
     return rows
 
 
 def share(source: Run, run: Run) -> None:
-    """Take over the stages that would come out alike: the planning trajectories, and what was fitted to them."""
+    """Take over the stages that would come out alike: the planning trajectories, what was fitted to them, and how
+    planner and explorer fare."""
 
-    def made_of(settings: Settings, stage: str) -> tuple[Any, ...]:
-        found = settings.prm, settings.controller, settings.sac
+    def made_of(run: Run, stage: str) -> tuple[Any, ...]:
+        settings = run.settings
+        if stage == "evaluate":  # in rooms, the references have a roadmap and a controller of their own
+            found = settings.episodes, settings.pairs_seed, settings.rooms and settings.rooms.worlds
+            return found if settings.rooms else (*found, *made_of(run, "controller"))
+        found = settings.prm, settings.controller, settings.sac, run.seed
         if stage in ("collect", "fit"):
             found += settings.collect, settings.rooms
         return (*found, settings.model, settings.fit, settings.value) if stage == "fit" else found
 
+    alike = [stage for stage in (*SHARED, "evaluate") if made_of(source, stage) == made_of(run, stage)]
     with open_run(run, resume=True):
-        for stage in ("controller", "collect", "fit"):
-            same = made_of(source.settings, stage) == made_of(run.settings, stage)
-            if same and source.done(stage) is not None and not (run.folder / stage).exists():
+        for stage in SHARED:
+            if stage in alike and source.done(stage) is not None and not (run.folder / stage).exists():
                 shutil.copytree(source.folder / stage, run.folder / stage)
+        if "evaluate" in alike and source.done("evaluate") is not None and not (run.folder / "evaluate").exists():
+            (run.folder / "evaluate").mkdir()
+            # Of each row the JSON file comes last: it says that the row is whole.
+            for ending in ("npz", "json"):
+                for file in (f for method in GUIDED for f in (source.folder / "evaluate").glob(f"*-{method}.{ending}")):
+                    shutil.copy(file, run.folder / "evaluate")
 
 
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
@@ -186,7 +206,7 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
 
 def origin(made: dict[str, Any]) -> dict[str, Any]:
     """Of what a run's ``config.json`` or ``provenance`` says, what stands in every row."""
-    return {key: made[key] for key in ("commit", "hardware", "created")}
+    return {key: made[key] for key in ("command", "commit", "hardware", "created")}
 
 
 def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, str]:
@@ -240,9 +260,22 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
 # --------------------------------------------------------------------------------------------------------- results
 
 
-def _write_results(file: Path, results: dict[str, Any]) -> None:
-    """Write the rows with the command that made them, and print them."""
+def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
+    """Write lists of rows; those in the file that were not measured anew, by other commands or earlier, stay."""
+
+    def subject(row: dict[str, Any]) -> tuple[Any, ...]:
+        model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
+        return (*model, *(row.get(name) for name in ("method", "maze", "density", "noise")))
+
+    kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
+    for name, rows in found.items():
+        anew = {subject(row) for row in rows}
+        kept[name] = [row for row in kept.get(name, []) if subject(row) not in anew] + rows
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_json(file, results)
-    print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in results["rows"]])
+    write_json(file, kept)
+
+
+def show_results(file: Path) -> None:
+    """Print a results file's rows."""
+    print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in read_json(file)["rows"]])
     print(f"results: {file}")

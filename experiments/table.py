@@ -43,7 +43,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     for row in rows:
         walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
     took = ", ".join(f"{variant} {np.mean(minutes):.0f} min" for variant, minutes in walls.items())
-    note = f"`{results['command']}`; {on} in each maze; models of seeds {seeds}; 95 % intervals; {origin(rows)}"
+    note = f"{commands(rows)}; {on} in each maze; models of seeds {seeds}; 95 % intervals; {origin(rows)}"
     return [*lines, "", f"{note}; a model takes: {took}."]
 
 
@@ -88,24 +88,24 @@ def room_table(results: dict[str, Any]) -> list[str]:
     names = ["model", "density", "noise", "success %", "SPL", "frontal %", "grazing %"]
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     together: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
-    for row in results["rows"] + results["density"] + results["noise"]:
+    sweeps = [*results.get("density", []), *results.get("noise", [])]
+    for row in results["rows"] + sweeps:
         name = row["variant"] if row["method"] == "ct" else row["method"]
-        rows = together.setdefault((name, row["density"], row["noise"]), [])
-        if row["model_seed"] not in [other["model_seed"] for other in rows]:  # the plain rooms are in every sweep
-            rows.append(row)
+        together.setdefault((name, row["density"], row["noise"]), []).append(row)
     for (name, density, noise), rows in together.items():
         spl = sum(row["spl"] for row in rows) / len(rows)
         name = name if len(rows) == 1 else f"{name}, {len(rows)} models"
         rates = [pooled(rows, rate) for rate in ("success", "frontal", "grazing")]
         lines.append("| " + " | ".join([name, f"{density:g}", f"{noise:g}", rates[0], f"{spl:.2f}", *rates[1:]]) + " |")
     lines += ["", "| model | noise | seven pairs: full | partial | failed |", "|---|---|---|---|---|"]
-    for row in results["seven"]:
+    for row in results.get("seven", []):
         name = f"{row['variant']}, seed {row['model_seed']}" if row["method"] == "ct" else row["method"]
         counts = [str(row[grade]) for grade in ("full", "partial", "failed")]
         lines.append("| " + " | ".join([name, f"{row['noise']:g}", *counts]) + " |")
     rows = results["rows"]
     on = f"{rows[0]['worlds']} random rooms, {rows[0]['pairs']} pairs in each, of seed {rows[0]['seed']}"
-    note = f"`{results['command']}`; {on}; 95 % intervals; {origin(rows)}."
+    on += f" ({sweeps[0]['pairs']} where density or noise is another)" if sweeps else ""
+    note = f"{commands(rows + sweeps)}; {on}; 95 % intervals; {origin(rows + sweeps)}."
     return [*lines, "", note]
 
 
@@ -129,7 +129,12 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
         lines.append("| " + " | ".join([robot, how, *(f"{100 * mean:.0f}" for mean in curve), reached]) + " |")
     seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows}))
     on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of seeds {seeds}"
-    return [*lines, "", f"`{results['command']}`; {on}; {origin(rows)}."]
+    return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+
+
+def commands(rows: list[dict[str, Any]]) -> str:
+    """The commands that made the rows."""
+    return ", ".join(f"`{command}`" for command in dict.fromkeys(row["command"] for row in rows))
 
 
 def origin(rows: list[dict[str, Any]]) -> str:
@@ -166,7 +171,7 @@ def _table(data: Any) -> list[str]:
         return benchmark_table(data)
     if "start" in data["rows"][0]:
         return transfer_table(data)
-    return room_table(data) if "seven" in data else experiment_table(data)
+    return room_table(data) if "worlds" in data["rows"][0] else experiment_table(data)
 
 
 def main() -> int:

@@ -146,7 +146,7 @@ def main(options: Options) -> None:
     prepare_jax()
     rows = measure(options)
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    write_json(RESULTS, {"command": provenance()["command"], "rows": rows})
+    write_json(RESULTS, {"rows": rows})
     draw(rows, PICTURE)
     print(f"results: {RESULTS}\npicture: {PICTURE}")
 

@@ -1,15 +1,15 @@
 """The paper's experiment for the Turtlebot3: cluttered rooms in PyBullet, 20 random ones with 25 pairs each.
 
-    python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct bc-ct f-ct cpu noise]
+    python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
-With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``), the
-same trained with noise, and planner and explorer beside them. F-CT and its lifted forms then meet rooms of 0.5 to 2
-times the density of training, sensors and motion of 0 to 2 times a real robot's errors, and the paper's seven pairs in
-one fixed room. Everything finished is kept: the same command goes on. Writes
-``experiments/results/turtlebot3-PRESET.json`` and the plots ``docs/turtlebot3-density.png`` and ``-noise.png``.
+With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``, and
+``cpu-ct`` before its fine-tuning), the same trained with noise, and planner and explorer beside them. The lifted ones
+of the first seed then meet rooms of 0.5 to 2 times the density of training, sensors and motion of 0 to 2 times a real
+robot's errors, and the paper's seven pairs in one fixed room. Everything finished is kept: the same command goes on.
+Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other seeds and variants stay, and the plots
+``docs/turtlebot3-density.png`` and ``-noise.png``.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +17,11 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
-DENSITIES = (0.5, 1.0, 1.5, 2.0)
-LEVELS = (0.0, 0.5, 1.0, 1.5, 2.0)
+DENSITIES = (0.5, 1.5, 2.0)  # besides 1, in which every variant is measured
+LEVELS = (0.5, 1.0, 2.0)  # besides 0
 SEVEN_LEVELS = (0.0, 1.0)
-SWEPT = ("ct", "f-ct", "cpu", "noise")  # variants that meet other densities and levels of noise
+SWEPT = ("cpu-ct", "cpu", "noise")  # variants that meet other densities and levels of noise
+SWEPT_PAIRS = 10  # in each room of those
 REFERENCES = ("planner", "explorer")
 
 
@@ -33,7 +34,9 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: ct, bc-ct, f-ct, cpu, noise. By default all."""
+    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu, noise. By default all."""
+    sweeps: bool = True
+    """Also other densities, levels of noise, and the seven pairs."""
     out: Path = Path("runs/turtlebot3")
     """Folder of the runs; what is finished there is not run again."""
 
@@ -57,6 +60,7 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
             "ct": ct,
             "bc-ct": replace(ct, model=replace(ct.model, returns=False)),
             "f-ct": published,
+            "cpu-ct": replace(lifted, rounds=0),
             "cpu": lifted,
             "noise": replace(lifted, rooms=replace(lifted.rooms, noise=1.0)),
         }
@@ -66,65 +70,48 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
     return {name: settings for name, settings in known.items() if not chosen or name in chosen}
 
 
-def run_all(options: Options) -> dict[str, Any]:
-    """Train and evaluate everything with each seed, continuing what is there; returns what the results file holds."""
-    from _variants import label, outcomes, share
+def run_all(options: Options) -> Path:
+    """Train and evaluate everything with each seed, continuing what is there; returns the results file."""
+    from _variants import Plan, label, run_plan, write_results
 
-    from ct_jax import pipeline
     from ct_jax.model import load_model
     from ct_jax.run import Run
 
-    rows: list[dict[str, Any]] = []
-    sweeps: dict[str, list[dict[str, Any]]] = {"density": [], "noise": [], "seven": []}
-    for seed in options.seeds:
-        before: list[Run] = []
-        for name, settings in variants_for(options.preset, options.variants).items():
-            folder = options.out / f"{name}-{seed}"
-            run = Run(folder, "turtlebot3", options.preset, settings, {}, {}, seed, "auto")
-            print(f"== turtlebot3: {name}, seed {seed}, in {folder}", file=sys.stderr)
-            for other in before:
-                share(other, run)
-            pipeline.train(run, resume=True)
-            before.append(run)
-            first = len(before) == 1 and seed == options.seeds[0]
-            found = [row for row in pipeline.results(folder) if first or row["method"] not in REFERENCES]
-            rows += [label(run, name, row | outcomes(folder / "evaluate", row)) for row in found]
-            if name in SWEPT or name == options.preset:
-                model = load_model(str(folder))
-                for kind, found in _sweep(folder, model, settings, references=first).items():
-                    sweeps[kind] += [label(run, name, row) for row in found]
-    return {"rows": rows, **sweeps}
+    file = RESULTS / f"turtlebot3-{options.preset}.json"
+    variants = variants_for(options.preset, options.variants)
+    run_plan(
+        "turtlebot3", Plan(variants), preset=options.preset, seeds=options.seeds, out=options.out,
+        keep=lambda rows: write_results(file, {"rows": rows}),
+    )  # fmt: skip
+    swept = [name for name in variants if options.sweeps and (name in SWEPT or name == options.preset)]
+    for name in swept:
+        folder = options.out / f"{name}-{options.seeds[0]}"
+        run = Run(folder, "turtlebot3", options.preset, variants[name], {}, {}, options.seeds[0], "auto")
+        found = _sweep(folder, load_model(str(folder)), variants[name], references=name == swept[0])
+        write_results(file, {kind: [label(run, name, row) for row in rows] for kind, rows in found.items()})
+    return file
 
 
 def _sweep(folder: Path, model: Any, settings: Any, *, references: bool) -> dict[str, list[dict[str, Any]]]:
     """Other densities, levels of noise, and the seven pairs."""
     from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 
-    where = {"worlds": settings.rooms.worlds, "pairs": settings.episodes}
-    seed = settings.pairs_seed
-    methods = ("ct", *REFERENCES) if references else ("ct",)
-    kept = folder / "sweeps"
+    kept, seed = folder / "sweeps", settings.pairs_seed
     kept.mkdir(exist_ok=True)
-    found: dict[str, list[dict[str, Any]]] = {"density": [], "noise": [], "seven": []}
-    for method in methods:
-        for density in DENSITIES:
-            row = _kept(
-                kept / f"density-{density}-{method}.json",
-                lambda m=method, d=density: evaluate_in_rooms(model, m, seed, density=d, **where),
-            )
-            found["density"].append(row)
-        for level in LEVELS:
-            row = _kept(
-                kept / f"noise-{level}-{method}.json",
-                lambda m=method, f=level: evaluate_in_rooms(model, m, seed, noise=f, **where),
-            )
-            found["noise"].append(row)
-        for level in SEVEN_LEVELS:
-            row = _kept(
-                kept / f"seven-{level}-{method}.json", lambda m=method, f=level: evaluate_seven_pairs(model, m, noise=f)
-            )
-            found["seven"].append(row)
-    return found
+    where = {"worlds": settings.rooms.worlds, "pairs": min(SWEPT_PAIRS, settings.episodes)}
+    measures: dict[str, tuple[tuple[float, ...], Callable[[str, float], dict[str, Any]]]] = {
+        "density": (DENSITIES, lambda method, at: evaluate_in_rooms(model, method, seed, density=at, **where)),
+        "noise": (LEVELS, lambda method, at: evaluate_in_rooms(model, method, seed, noise=at, **where)),
+        "seven": (SEVEN_LEVELS, lambda method, at: evaluate_seven_pairs(model, method, noise=at)),
+    }
+    return {
+        kind: [
+            _kept(kept / f"{kind}-{at}-{method}.json", lambda m=method, a=at, f=measure: f(m, a))
+            for method in ("ct", *REFERENCES[: 2 * references])
+            for at in points
+        ]
+        for kind, (points, measure) in measures.items()
+    }
 
 
 def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -133,6 +120,11 @@ def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     if not file.is_file():
         write_json(file, measure())
     return read_json(file)
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """The plots' line to which a row belongs."""
+    return row["variant"] if row["method"] == "ct" else row["method"]
 
 
 def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) -> None:
@@ -145,9 +137,8 @@ def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) ->
     ax = figure.add_subplot()
     lines: dict[str, dict[float, list[tuple[int, int]]]] = {}
     for row in rows:
-        name = row["variant"] if row["method"] == "ct" else row["method"]
         counts = round(row["success_rate"] * row["episodes"]), row["episodes"]
-        lines.setdefault(name, {}).setdefault(row[axis], []).append(counts)
+        lines.setdefault(line_of(row), {}).setdefault(row[axis], []).append(counts)
     for name, points in lines.items():
         x = sorted(points)
         won, of = (([sum(count[i] for count in points[at]) for at in x]) for i in (0, 1))
@@ -166,22 +157,21 @@ def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) ->
 def main() -> int:
     """Run the experiment from the command line; returns the exit status."""
     import tyro
+    from _variants import show_results
 
-    from ct_jax.checkpoint import write_json
-    from ct_jax.cli import guarded, prepare_jax, print_rows
-    from ct_jax.run import provenance
+    from ct_jax.checkpoint import read_json
+    from ct_jax.cli import guarded
 
     def run() -> None:
         options = tyro.cli(Options, description=__doc__)
-        prepare_jax()
-        found = run_all(options)
-        file = RESULTS / f"turtlebot3-{options.preset}.json"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, {"command": provenance()["command"], **found})
+        file = run_all(options)
+        found = read_json(file)
         for axis, label in (("density", "density of obstacles / that of training"), ("noise", "level of noise")):
-            draw_sweep(found[axis], axis, label, ROOT / "docs" / f"turtlebot3-{axis}.png")
-        print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in found["rows"]])
-        print(f"results: {file}")
+            if axis in found:
+                swept = {line_of(row) for row in found[axis]}
+                rows = found[axis] + [row for row in found["rows"] if line_of(row) in swept]
+                draw_sweep(rows, axis, label, ROOT / "docs" / f"turtlebot3-{axis}.png")
+        show_results(file)
 
     return guarded(run)
 

@@ -10,14 +10,17 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from _variants import Baselines, Plan, plan_for, run_plan, share
+from _variants import Baselines, Plan, plan_for, run_plan, share, write_results
 from table import differences, interval_of_mean, room_table, transfer_table
 from turtlebot3 import variants_for
 
 from ct_envs import MazeEnv, UserError
 from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAlone
+from ct_jax.checkpoint import read_json
 from ct_jax.run import Run, load_mazes
+
+MADE = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00"}
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
@@ -73,6 +76,23 @@ def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_p
         share(source, other)
         stages = [stage for stage in ("controller", "collect", "fit") if other.done(stage) is not None]
         assert stages == ["controller", "collect", "fit"][: taken[name]]
+        rows = {file.stem.rpartition("-")[2] for file in (other.folder / "evaluate").glob("*.json")}
+        assert rows == (set() if name == "prm" else {"planner", "explorer"})
+
+
+def test_rows_of_other_sittings_stay_in_the_results(tmp_path):
+    def row(variant, seed, success, method="ct"):
+        return {"variant": variant, "model_seed": seed, "method": method, "maze": "m", "success_rate": success}
+
+    file = tmp_path / "new" / "results.json"
+    write_results(file, {"rows": [row("ct", 0, 0.1), row("ct", 0, 0.9, "planner")], "noise": [row("ct", 0, 0.3)]})
+    write_results(file, {"rows": [row("ct", 1, 0.2), row("bc", 0, 0.3), row("bc", 0, 0.8, "planner")]})
+    write_results(file, {"rows": [row("ct", 0, 0.4)]})
+    found = read_json(file)
+    assert [(r["variant"], r["model_seed"], r["method"], r["success_rate"]) for r in found["rows"]] == [
+        ("ct", 1, "ct", 0.2), ("bc", 0, "ct", 0.3), ("bc", 0, "planner", 0.8), ("ct", 0, "ct", 0.4),
+    ]  # fmt: skip
+    assert found["noise"] == [row("ct", 0, 0.3)]
 
 
 def test_what_fine_tuning_adds_is_told_pair_by_pair():
@@ -92,7 +112,8 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
 
 def test_the_turtlebots_rows_share_what_they_can():
     known = variants_for("cpu")
-    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu", "noise"]
+    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu", "noise"]
+    assert replace(known["cpu"], rounds=0) == known["cpu-ct"]
     ct, bc, fct = (known[name] for name in ("ct", "bc-ct", "f-ct"))
     assert replace(fct, rounds=0) == ct and fct.rounds == 1 and fct.recover.keep == "separate"
     assert replace(bc, model=ct.model) == ct and not bc.model.returns
@@ -106,26 +127,25 @@ def test_the_turtlebots_rows_share_what_they_can():
 def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
     def row(variant, seed, density, success, **more):
         rates = {"success_rate": success, "frontal_rate": 0.0, "grazing_rate": 0.1}
-        made = {"commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00", "worlds": 20, "pairs": 25}
+        made = MADE | {"worlds": 20, "pairs": 25}
         what = {"variant": variant, "method": "ct", "model_seed": seed, "density": density, "noise": 0.0, "spl": 0.5}
         return what | rates | made | {"episodes": 500, "seed": 0} | more
 
     rows = [row("ct", 0, 1.0, 0.9), row("ct", 1, 1.0, 1.0)]
     seven = [row("ct", 0, 1.0, 0.9, full=60, partial=5, failed=5)]
-    sweep = [*rows, row("ct", 0, 1.5, 0.8)]
-    lines = room_table({"command": "python", "rows": rows, "density": sweep, "noise": rows, "seven": seven})
+    lines = room_table({"rows": rows, "density": [row("ct", 0, 1.5, 0.8)], "seven": seven})
     assert [line.split(" | ")[3] for line in lines[2:4]] == ["95.0 (93 to 96)", "80.0 (76 to 83)"]
     assert "ct, 2 models" in lines[2] and any("| 60 | 5 | 5 |" in line for line in lines)
 
 
 def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
-    made = {"commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00", "episodes": 100}
+    made = MADE | {"episodes": 100}
     curves = {("scratch", 0): (0.0, 0.2, 0.8), ("scratch", 1): (0.0, 0.4, 1.0), ("ant", 0): (0.5, 0.85, 0.9)}
     rows = [
         {"robot": "point", "start": start, "seed": seed, "updates": mark, "success_rate": rate} | made
         for (start, seed), curve in curves.items()
         for mark, rate in zip((25, 50, 100), curve, strict=True)
     ]
-    lines = transfer_table({"command": "python", "rows": rows})
+    lines = transfer_table({"rows": rows})
     assert lines[2] == "| point | from scratch | 0 | 30 | 90 | 100 |"
     assert lines[3] == "| point | from the ant's trunk | 50 | 85 | 90 | 50 |"
