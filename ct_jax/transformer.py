@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ct_envs.frames import own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
+from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
 TOKENS = 3  # of a step: return-to-go, state, action
@@ -74,7 +75,7 @@ class MapEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, maps: UInt8[Array, "*b 2 k k"]) -> Float[Array, "*b width"]:
-        maps, dense = maps.astype(self.dtype or jnp.float32), functools.partial(nn.Dense, dtype=self.dtype)
+        maps, dense = maps.astype(self.dtype or jnp.float32), functools.partial(Dense, dtype=self.dtype)
         lead, n, p = maps.shape[:-3], maps.shape[-1] // self.patch, self.patch
         x = maps.reshape(*lead, 2, n, p, n, p)
         x = jnp.moveaxis(x, (-5, -3, -1), (-3, -2, -1)).reshape(*lead, n, n, 2 * p * p)
@@ -98,12 +99,12 @@ class Block(nn.Module):
     attention: Attention | None = None
 
     def setup(self) -> None:
-        width, dense = self.config.width, functools.partial(nn.Dense, dtype=self.dtype)
+        width, dense = self.config.width, functools.partial(Dense, dtype=self.dtype)
         self.norm_attention, self.norm_mlp = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
         self.qkv = dense(3 * width)
         self.project = dense(width)
         self.up, self.down = dense(4 * width), dense(width)
-        self.dropout = nn.Dropout(self.config.dropout)
+        self.dropout = Dropout(self.config.dropout)
 
     def heads(self, x: Float[Array, "B T W"]) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Queries, keys and values, each [B, T, heads, W / heads]."""
@@ -130,7 +131,7 @@ def body_features(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], 
 
 def directions(x: Float[Array, "*b W"], heading: Float[Array, "*b 2"], n: int) -> Float[Array, "*b 2n"]:
     """n planar vectors of the world from a dense layer, as a robot of that heading sees them; inside a module."""
-    where = nn.Dense(2 * n)(x)
+    where = Dense(2 * n)(x)
     where = turn(heading[..., None, :], where.reshape(*where.shape[:-1], n, 2))
     return where.reshape(*where.shape[:-2], -1)
 
@@ -150,8 +151,8 @@ class HeadingHead(nn.Module):
         heading, own = body_features(proprio)
         hidden = jnp.concatenate([directions(x, heading, self.directions), own], -1)
         for _ in range(2):
-            hidden = nn.relu(nn.Dense(self.width)(hidden))
-        return nn.Dense(self.action_size)(hidden)
+            hidden = nn.relu(Dense(self.width)(hidden))
+        return Dense(self.action_size)(hidden)
 
 
 class ControlTransformer(nn.Module):
@@ -167,7 +168,7 @@ class ControlTransformer(nn.Module):
     attention: Attention | None = None
 
     def setup(self) -> None:
-        c, dense = self.config, functools.partial(nn.Dense, dtype=self.dtype)
+        c, dense = self.config, functools.partial(Dense, dtype=self.dtype)
         self.encode_map = MapEncoder(c.width, dtype=self.dtype)
         self.embed_goal = dense(c.width)
         self.embed_state = dense(c.width)
@@ -177,12 +178,12 @@ class ControlTransformer(nn.Module):
             c.max_timestep, c.width, embedding_init=nn.initializers.normal(0.02), dtype=self.dtype
         )
         self.norm_in, self.norm_out = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
-        self.dropout = nn.Dropout(c.dropout)
+        self.dropout = Dropout(c.dropout)
         self.blocks = [Block(c, self.dtype, self.attention) for _ in range(c.layers)]
         if c.frame == "heading":
             self.head = HeadingHead(c.directions, self.action_size)
         else:
-            self.predict_action = nn.Dense(self.action_size)
+            self.predict_action = Dense(self.action_size)
 
     def _embed_time(self, timestep: jax.Array) -> jax.Array:
         """The embedding of the absolute timestep, shared by the tokens of a step."""

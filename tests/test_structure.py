@@ -12,7 +12,8 @@ ORDER = [
     *["compilation", "interrupts", "devices", "checkpoint", "progress"],
     *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
     *["drive", "explorer_turtlebot3", "collect_turtlebot3"],
-    *["transformer", "value", "fit", "policy", "evaluate", "finetune", "evaluate_turtlebot3", "finetune_turtlebot3"],
+    *["dense", "transformer", "value", "fit", "policy", "evaluate", "finetune"],
+    *["evaluate_turtlebot3", "finetune_turtlebot3"],
     *["baselines", "transfer", "presets", "model", "run"],
     *["report", "mazes", "rooms", "pipeline", "cli"],
 ]
