@@ -6,7 +6,9 @@ The peer is Stable-Baselines3's SAC (torch) on the same environments: ours, comp
 ``VecEnv``, with the same networks, batch, rewards and normalised inputs, at one update a step of one environment and at
 our setting (64 environments, 8 updates a step). Both are timed with all they do besides: stepping, storing, drawing.
 An episode that times out ends for the peer as one that fails: ours go on by themselves, and their last observation is
-not kept. With --full the peer, too, learns until it walks 90 % of the edges.
+not kept. *Products alone* is as much work as an update's, counted by XLA, in nothing but matrix products of its size,
+four that do not wait for each other: what no learner with this batch and these networks can outrun here. With --full
+the peer, too, learns until it walks 90 % of the edges.
 
 Last results:
 
@@ -47,6 +49,7 @@ from ct_jax.controllers.sac import Sac, SacConfig, SacController, edge_success, 
 from ct_jax.prm import build_roadmap
 
 PEER = "Stable-Baselines3"
+PRODUCTS = "products alone"
 CHUNK = 5  # iterations between two looks at what is learned
 
 
@@ -71,23 +74,42 @@ def main(options: SacOptions) -> None:
     results = Results(__file__, options)
     peer = has_peer("stable_baselines3", PEER)
     for robot in options.robots:
+        flop = None
         for envs, updates, asked in ((1, 1, 2.5), (64, 8, 5.0)):
-            count(robot, SacConfig(envs=envs, updates=updates), peer, asked, options, results)
+            ours = Learner(robot, SacConfig(envs=envs, updates=updates))
+            flop = flop or update_flop(ours)
+            count(ours, flop, peer, asked, options, results)
     learn(peer and options.full, options, results)
     results.finish()
 
 
-def count(robot: str, config: SacConfig, peer: bool, asked: float, options: SacOptions, results: Results) -> None:
-    """The row of a robot's updates."""
+def count(ours: "Learner", flop: float, peer: bool, asked: float, options: SacOptions, results: Results) -> None:
+    """The rows of a robot's updates, each of so many operations."""
+    config = ours.sac.config
     iterations = max(1, options.updates // config.updates)
     work = float(iterations * config.updates)
-    ours = Learner(robot, config)
-    others = {}
+    others = {PRODUCTS: products(config, flop, work)}
     if peer:
         theirs = PeerLearner(ours)
-        others = {PEER: Contestant(lambda: theirs.train(iterations), work)}
-    name = f"{robot}, {config.envs} environments, {config.updates} updates a step"
+        others[PEER] = Contestant(lambda: theirs.train(iterations), work)
+    name = f"{ours.env.robot.name}, {config.envs} environments, {config.updates} updates a step"
     results.race(name, "updates/s", Contestant(lambda: ours.train(iterations), work), others, asked={PEER: asked})
+
+
+def update_flop(learner: "Learner") -> float:
+    """Floating-point operations of an update, as XLA counts them, by a learner with one an iteration."""
+    one = jax.jit(learner.sac._updates).lower(learner.state).compile()
+    return float(one.cost_analysis()["flops"])  # pyright: ignore
+
+
+def products(config: SacConfig, flop: float, updates: float) -> Contestant:
+    """So many updates' operations in matrix products of the batch with a hidden layer."""
+    width = config.hidden[-1]
+    layer = jax.random.normal(jax.random.key(0), (width, width)) / width**0.5
+    batches = tuple(jax.random.normal(jax.random.key(1), (4, config.batch, width)))
+    times = max(1, round(updates * flop / (4 * 2 * config.batch * width**2)))
+    multiply = jax.jit(lambda x: jax.lax.fori_loop(0, times, lambda _, x: tuple(each @ layer for each in x), x))
+    return Contestant(lambda: multiply(batches), updates)
 
 
 def learn(peer: bool, options: SacOptions, results: Results) -> None:

@@ -169,7 +169,7 @@ class ShortcutGuide:
         stay as near."""
         ends = np.minimum(world.clearance(points), float(world.clearance(position))) - _NUDGE_M
         room = np.minimum(ends, RADIUS_M + max(self.margin_m - slack_m, 0.0))
-        return world.segment_free(np.broadcast_to(position, points.shape), points, room)
+        return world.segment_free(np.stack(np.broadcast_arrays(position, points), -2), room)
 
 
 AnyGuide = WayGuide | ShortcutGuide | ExplorerGuide

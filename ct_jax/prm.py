@@ -73,8 +73,8 @@ class Space(Protocol):
         """Distance [k] (m) from points [k, 2] (m) to the nearest obstacle."""
         ...
 
-    def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Whether discs of ``radius`` [k] (m) swept from ``a`` to ``b`` [k, 2] (m) touch nothing."""
+    def segment_free(self, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Whether discs of ``radius`` [k] (m) swept from one end to the other, ``ends`` [k, 2, 2] (m), touch nothing."""
         ...
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
@@ -166,7 +166,7 @@ def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     # Between samples the margin is kept; to given points only the radius.
     first, second = pairs.T
     clear = roadmap.radius_m + roadmap.config.margin_m * (np.maximum(first, second) < roadmap.config.samples)
-    free = as_space(roadmap.maze).segment_free(points.take(first, 0), points.take(second, 0), clear)
+    free = as_space(roadmap.maze).segment_free(points.take(pairs, 0), clear)
     return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs.take(np.flatnonzero(free), 0)]))
 
 
@@ -196,13 +196,13 @@ class MazeSpace:
         """As ``Space`` says; at most one cell."""
         return np.asarray(_clearances(self.maze, jnp.asarray(points, jnp.float32)))
 
-    def segment_free(self, a: np.ndarray, b: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    def segment_free(self, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """As ``Space`` says."""
-        ends, radius = np.asarray(np.stack([a, b], 1), np.float32), np.asarray(radius, np.float32)
+        ends, radius = np.asarray(ends, np.float32), np.asarray(radius, np.float32)
         free, unclear = _in_blocks(functools.partial(_by_cells, self.maze), ends, radius)
         which = np.flatnonzero(unclear)
         ends, radius = ends.take(which, 0), radius.take(which)
-        longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).max(initial=0.0))
+        longest = float(np.hypot(*(ends[:, 1] - ends[:, 0]).T).max(initial=0.0))
         reach = segment_reach(longest, float(radius.max(initial=0.0)), float(self.maze.cell_m))
         (free[which],) = _in_blocks(functools.partial(_segments_free, self.maze, reach=reach), ends, radius)
         return free
@@ -212,7 +212,7 @@ class MazeSpace:
         return _sample_points(rng, self.maze, radius, n)
 
 
-_BLOCK = 32_768  # most edges that are checked at once: they stay in the processor's cache and share one program
+_BLOCK = 16_384  # most edges that are checked at once: they stay in the processor's cache and share one program
 
 
 def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:

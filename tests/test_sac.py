@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training import replay_buffers
 from brax.training.acme import running_statistics, specs
 from brax.training.types import Transition
 
@@ -14,6 +15,7 @@ from ct_envs import ANT, POINT, MazeEnv, Tasks, UserError, load_maze
 from ct_envs.frames import symmetries
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.controllers.sac import (
+    Replay,
     Sac,
     SacConfig,
     SacController,
@@ -149,9 +151,23 @@ def test_the_replay_holds_what_happened(sac, fresh):
     assert all(found)
 
 
+@pytest.mark.parametrize("size", [12, 13])
+def test_the_ring_gives_what_braxs_queue_gives(size):
+    """To the bit, while it fills and long after; 13 is no multiple of what is put in at once."""
+    example = {"number": jnp.zeros(()), "pair": jnp.zeros(2)}
+    ring, queue = (kind(size, example, 32) for kind in (Replay, replay_buffers.UniformSamplingQueue))
+    ours, theirs = ring.init(jax.random.key(0)), queue.init(jax.random.key(0))
+    for i in range(10):
+        number = 4.0 * i + jnp.arange(4.0)
+        rows = {"number": number, "pair": jnp.stack([number, -number], 1)}
+        ours, theirs = ring.insert_internal(ours, rows), queue.insert_internal(theirs, rows)
+        (ours, drawn), (theirs, expected) = ring.sample_internal(ours), queue.sample_internal(theirs)
+        assert same(drawn, expected) and int(ring.size(ours)) == int(queue.size(theirs))
+
+
 def test_the_target_follows_at_its_rate(sac, fresh):
     state, _ = sac.train(fresh, TINY.warmup + 2)
-    after, _ = jax.jit(sac._update)(state)
+    after, _ = jax.jit(make(replace(TINY, updates=1))._updates)(state)
     rate = TINY.target_rate
     for old, new, critic in zip(*map(leaves, (state.target_critic, after.target_critic, after.critic)), strict=True):
         np.testing.assert_allclose(new, (1 - rate) * old + rate * critic, atol=1e-6)

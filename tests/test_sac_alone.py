@@ -119,6 +119,6 @@ def test_what_it_cannot_do_is_an_error(wrong):
 def test_without_compilation(learner, fresh):
     warm, _ = learner.train(fresh, 2)
     with jax.disable_jit():
-        state, _ = learner._update(learner._collect(warm)[0])
+        state, _ = learner._updates(learner._collect(warm)[0])
     assert not same(state.policy, warm.policy)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.policy, state.critic)))

@@ -106,13 +106,13 @@ def test_a_segment_has_the_least_clearance_of_its_points(seed):
     clear = sampled > 0.02
     assert (np.abs(exact - sampled)[clear] < 0.02).all() and (exact <= sampled + 1e-9)[clear].all()
     assert (exact[sampled < 0] <= 0).all()
-    np.testing.assert_array_equal(world.segment_free(a, b, 0.1), exact >= 0.1)
+    np.testing.assert_array_equal(world.segment_free(np.stack([a, b], -2), 0.1), exact >= 0.1)
 
 
 def test_an_empty_room_has_its_walls_only():
     assert EMPTY.clearance(np.array([2.0, 1.0])) == 1.0
-    assert EMPTY.segment_free(np.array([1.0, 1.0]), np.array([4.0, 1.0]), 0.99)
-    assert not EMPTY.segment_free(np.array([1.0, 1.0]), np.array([4.0, 1.0]), 1.01)
+    assert EMPTY.segment_free(np.array([[1.0, 1.0], [4.0, 1.0]]), 0.99)
+    assert not EMPTY.segment_free(np.array([[1.0, 1.0], [4.0, 1.0]]), 1.01)
 
 
 @given(SEEDS, st.sampled_from([None, 0.0, 0.05, 0.15, 0.25]))
@@ -222,11 +222,11 @@ def test_a_roadmap_of_a_world_has_the_free_edges_only(seed):
     assert world.clearance(a + share * (b - a)).min() >= RADIUS_M + 0.05 - 1e-5
     i, j = np.triu_indices(60, 1)
     near = np.linalg.norm(roadmap.points[i] - roadmap.points[j], axis=-1) <= 2.0
-    free = world.segment_free(roadmap.points[i], roadmap.points[j], RADIUS_M + 0.05)
+    free = world.segment_free(roadmap.points[np.stack([i, j], -1)], RADIUS_M + 0.05)
     expected = np.stack([i, j], -1)[near & free]
     assert {tuple(edge) for edge in roadmap.edges.tolist()} == {tuple(pair) for pair in expected.tolist()}
     way = roadmap.plan(*world.sample_pair(np.random.default_rng(seed), RADIUS_M))
-    assert isinstance(way, Way) and world.segment_free(way.points[:-1], way.points[1:], RADIUS_M).all()
+    assert isinstance(way, Way) and world.segment_free(np.stack([way.points[:-1], way.points[1:]], -2), RADIUS_M).all()
 
 
 def test_a_plan_through_a_wall_is_none():
@@ -708,7 +708,7 @@ def test_a_shortcut_is_in_sight_and_no_detour(seed):
     assert np.isfinite(field.to_go).mean() > 0.9 and field.to_go[-1] == 0
     for position in room.world.sample_free(rng, 20, RADIUS_M + 1e-3):
         target = guide._choose(field, position)
-        assert room.world.segment_free(position, target, RADIUS_M - 2e-3) or (target == goal).all()
+        assert room.world.segment_free(np.stack([position, target]), RADIUS_M - 2e-3) or (target == goal).all()
     for index in rng.integers(len(field.points) - 1, size=10):  # at a waypoint, the robot goes on
         position = field.points[index] + 0.02
         assert np.linalg.norm(guide._choose(field, position) - position) >= guide.waypoint_tolerance_m

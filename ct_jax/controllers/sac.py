@@ -174,6 +174,26 @@ def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
     return tasks.replace(follow=jnp.asarray(follow, jnp.int32))
 
 
+class Replay(replay_buffers.UniformSamplingQueue):
+    """brax's queue, from which the same is drawn to the bit, as a ring.
+
+    brax's moves all that it holds at each insertion once it is full. Here positions only ever grow and rows are found
+    modulo the size, as brax looks them up.
+    """
+
+    def insert_internal(
+        self, buffer_state: replay_buffers.ReplayBufferState, samples: Transition
+    ) -> replay_buffers.ReplayBufferState:
+        rows, size = self._flatten_fn(samples), len(buffer_state.data)
+        where = (buffer_state.insert_position + jnp.arange(len(rows))) % size
+        end = buffer_state.insert_position + len(rows)
+        return buffer_state.replace(
+            data=buffer_state.data.at[where].set(rows, unique_indices=True),
+            insert_position=end,
+            sample_position=jnp.maximum(buffer_state.sample_position, end - size),
+        )
+
+
 class Sac:
     """The learner: ``create`` and ``train`` on states, both pure.
 
@@ -217,7 +237,7 @@ class Sac:
             next_observation=jnp.zeros(size),
             extras={"state_extras": {"truncation": jnp.zeros(()), "fall": jnp.zeros(())}},
         )
-        self._buffer = replay_buffers.UniformSamplingQueue(config.replay, example, config.batch)
+        self._buffer = Replay(config.replay, example, config.updates * config.batch)
         self.train = jax.jit(self._train, static_argnames="iterations")
 
     def _make_networks(self) -> sac_networks.SACNetworks:
@@ -401,7 +421,16 @@ class Sac:
         return batch._replace(reward=jnp.where(fall > 0, for_ever, batch.reward))
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
-        state, losses = jax.lax.scan(lambda s, _: self._update(s), state, length=self.config.updates)
+        """The updates of an iteration; their batches are drawn at once, for meanwhile nothing is added."""
+        key, present_key, update_key = jax.random.split(state.key, 3)
+        replay, drawn = self._buffer.sample_internal(state.replay)
+        drawn = self._pay_falls(self._present(drawn, _one_maze(state), present_key), state.iteration)
+        count = self.config.updates
+        batches = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), drawn)
+        state = state.replace(replay=replay, key=key)
+        # Of "rbg" keys the noise is one operation on a CPU; of the others it is a loop of many.
+        keys = jax.random.wrap_key_data(jax.random.bits(update_key, (count, 2, 4)), impl="rbg")
+        state, losses = jax.lax.scan(self._update, state, (batches, keys))
         return state, jax.tree.map(jnp.mean, losses)
 
     def _present(self, batch: Transition, maze: Maze, key: jax.Array) -> Transition:
@@ -420,12 +449,11 @@ class Sac:
             action = transform(joints, action)
         return batch._replace(observation=self._see(now, maze), action=action, next_observation=self._see(after, maze))
 
-    def _update(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
-        key, alpha_key, critic_key, actor_key, mirror_key = jax.random.split(state.key, 5)
-        replay, batch = self._buffer.sample_internal(state.replay)
-        batch = self._pay_falls(self._present(batch, _one_maze(state), mirror_key), state.iteration)
+    def _update(self, state: SacState, drawn: tuple[Transition, jax.Array]) -> tuple[SacState, dict[str, jax.Array]]:
+        batch, (policy_key, critic_key) = drawn
+        # The temperature and the policy are judged by the same actions, which are computed once.
         alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
-            state.log_alpha, state.policy, state.normalizer, batch, alpha_key, optimizer_state=state.alpha_optimizer
+            state.log_alpha, state.policy, state.normalizer, batch, policy_key, optimizer_state=state.alpha_optimizer
         )
         alpha = jnp.exp(state.log_alpha)
         critic_loss, critic, critic_optimizer = self._critic_update(
@@ -433,7 +461,7 @@ class Sac:
             optimizer_state=state.critic_optimizer,
         )  # fmt: skip
         actor_loss, policy, policy_optimizer = self._actor_update(
-            state.policy, state.normalizer, state.critic, alpha, batch, actor_key,
+            state.policy, state.normalizer, state.critic, alpha, batch, policy_key,
             optimizer_state=state.policy_optimizer,
         )  # fmt: skip
         average = optax.incremental_update(policy, state.average, 1.0 - self.config.average)
@@ -441,7 +469,6 @@ class Sac:
         state = state.replace(
             policy=policy, average=average, critic=critic, target_critic=target, log_alpha=log_alpha,
             policy_optimizer=policy_optimizer, critic_optimizer=critic_optimizer, alpha_optimizer=alpha_optimizer,
-            replay=replay, key=key,
         )  # fmt: skip
         losses = {"alpha_loss": alpha_loss, "critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
         return state, losses

@@ -56,11 +56,9 @@ class World:
         to_cylinder = _segment_to_point(a[..., None, :] - centre, b[..., None, :] - centre) - radius
         return np.minimum(nearest, np.concatenate([to_box, to_cylinder], -1).min(-1, initial=np.inf))
 
-    def segment_free(
-        self, a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*n 2"], radius: float | np.ndarray
-    ) -> Bool[np.ndarray, "*n"]:
-        """Whether discs of ``radius`` [m] swept from ``a`` to ``b`` [m] touch nothing."""
-        room = self.segment_clearance(a, b)
+    def segment_free(self, ends: Float[np.ndarray, "*n 2 2"], radius: float | np.ndarray) -> Bool[np.ndarray, "*n"]:
+        """Whether discs of ``radius`` [m] swept from one end to the other [m] touch nothing."""
+        room = self.segment_clearance(ends[..., 0, :], ends[..., 1, :])
         return (room >= radius) & (room > 0)
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> Float[np.ndarray, "n 2"]:
