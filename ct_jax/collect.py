@@ -216,13 +216,15 @@ def draw_batch(
     per_map = -(-config.envs // n_maps)
     maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]
     keys = jax.random.split(key, n_maps + 1)
+    # Each process builds its share of the roadmaps, and tells the others.
+    mine = np.array_split(np.arange(n_maps), jax.process_count())[jax.process_index()]
     drawn = [
-        _endpoints(k, jax.tree.map(lambda leaf, m=m: leaf[m], mazes), env, config, prm, per_map)
-        for k, m in zip(keys[:-1], maze_of_map, strict=True)
+        _endpoints(keys[i], jax.tree.map(lambda leaf, m=maze_of_map[i]: leaf[m], mazes), env, config, prm, per_map)
+        for i in (mine if len(mine) else [0])  # without a share, one for its shapes
     ]
-    tables = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[table for table, _, _ in drawn])
+    tables, start, goal = jax.tree.map(lambda *leaves: joined(np.stack(leaves)[: len(mine)]), *drawn)
     order = fill_up(config.envs, data_mesh())
-    start, goal = (jnp.concatenate([each[i] for each in drawn])[order] for i in (1, 2))
+    start, goal = (jnp.asarray(ends.reshape(-1, 2)[order]) for ends in (start, goal))
     which = np.repeat(np.arange(n_maps), per_map)[order]
     maze = jax.tree.map(lambda leaf: leaf[maze_of_map[which]], mazes)
     state = start_episodes(env, keys[-1], maze, start, goal)
