@@ -8,6 +8,7 @@ import importlib.util
 import io
 import json
 import math
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from ct_jax.compilation import keep_programs
 from ct_jax.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
@@ -28,6 +30,7 @@ PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", 
 LAST = "\n\nLast results:\n\n"
 _WIDTH = 116
 _FEWEST = 2  # rounds of a race
+COMMIT = "BENCH_COMMIT"  # variable in which ``make bench`` names the commit: what it writes is no change of the code
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Options:
     """The long sweeps, too."""
     repeat: int = 7
     """Rounds, in each of which every contestant has its turn."""
-    limit_s: float = 6.0
+    limit_s: float = 4.0
     """Time after which a race ends with fewer rounds than that, but at least two (--full: none)."""
     write: bool = True
     """Keep the results, and the table in the docstring; without it they are only printed."""
@@ -50,6 +53,7 @@ class Contestant:
 
     run: Callable[[], object]
     work: float = 1.0  # of one call, in the unit that is counted
+    compiles: bool = True  # at its first call, which is a warm-up then
 
 
 def has_peer(module: str, name: str) -> bool:
@@ -65,20 +69,23 @@ def about(docstring: str | None) -> str:
     return (docstring or "").split(LAST)[0]
 
 
-def time_together(*functions: Callable[[], object], repeat: int, limit_s: float = math.inf) -> list[list[float]]:
+def time_together(*contestants: Contestant, repeat: int, limit_s: float = math.inf) -> list[list[float]]:
     """Seconds of each, taken in turn (A B C A B C ...) after one warm-up, so that a drifting machine hurts none.
 
     No further round begins after ``limit_s``, once there have been two.
     """
+    for each in contestants:
+        if each.compiles:
+            jax.block_until_ready(each.run())
     rounds: list[list[float]] = []
-    while len(rounds) <= repeat and (len(rounds) <= _FEWEST or sum(map(sum, rounds[1:])) < limit_s):
+    while len(rounds) < repeat and (len(rounds) < _FEWEST or sum(map(sum, rounds)) < limit_s):
         taken = []
-        for function in functions:
+        for each in contestants:
             begun = time.perf_counter()
-            jax.block_until_ready(function())
+            jax.block_until_ready(each.run())
             taken.append(time.perf_counter() - begun)
         rounds.append(taken)
-    return [list(times) for times in zip(*rounds[1:], strict=True)]  # the first was the warm-up
+    return [list(times) for times in zip(*rounds, strict=True)]
 
 
 _FIGURES: dict[str, Callable[[float, float], float]] = {
@@ -98,6 +105,9 @@ class Results:
     def __init__(self, file: str, options: Options):
         self.file, self.options = Path(file), options
         self._rows: list[dict[str, Any]] = []
+        self._made = provenance()  # before anything is written
+        self._made["commit"] = os.environ.get(COMMIT) or self._made["commit"]
+        keep_programs()  # what several rows share is compiled once
 
     def add(
         self, name: str, unit: str, values: list[float], *, against: str = "", other: list[float] | None = None,
@@ -127,7 +137,7 @@ class Results:
         figure = _FIGURES.get(unit, lambda seconds, work: work / seconds)
         every = [ours, *others.values()]
         limit_s = math.inf if self.options.full else self.options.limit_s
-        times = time_together(*(each.run for each in every), repeat=self.options.repeat, limit_s=limit_s)
+        times = time_together(*every, repeat=self.options.repeat, limit_s=limit_s)
         values = [[figure(t, each.work) for t in taken] for each, taken in zip(every, times, strict=True)]
         for (label, rival), taken, other in zip(others.items(), times[1:], values[1:], strict=True):
             speeds = [(ours.work / a) / (rival.work / b) for a, b in zip(times[0], taken, strict=True)]
@@ -139,9 +149,8 @@ class Results:
 
     def finish(self) -> None:
         """Print the table, and write it down."""
-        made = provenance()
-        made["versions"] |= {name: metadata.version(name) for name in PEERS if _installed(name)}
-        rows = [row | {"made": made} for row in self._rows]
+        self._made["versions"] |= {name: metadata.version(name) for name in PEERS if _installed(name)}
+        rows = [row | {"made": self._made} for row in self._rows]
         print(table_of(rows))
         if self.options.write:
             RESULTS.mkdir(exist_ok=True)

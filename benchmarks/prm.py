@@ -73,6 +73,8 @@ class PrmOptions(Options):
     """Points up to which the Python loop is measured (--full: all)."""
     loop_table_up_to: int = 200
     """Points up to which its table is (--full: 1000)."""
+    ompl_up_to: int = 1000
+    """Points up to which OMPL is measured (--full: all)."""
 
 
 def main(options: PrmOptions) -> None:
@@ -81,7 +83,7 @@ def main(options: PrmOptions) -> None:
     maze = load_maze("antmaze-large")
     ompl = has_peer("ompl", OMPL)
     for samples in options.samples:
-        measure(maze, samples, ompl, options, results)
+        measure(maze, samples, ompl and (options.full or samples <= options.ompl_up_to), options, results)
     growth(maze, options, results)
     results.finish()
 
@@ -100,9 +102,9 @@ def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: 
     walls, points = np.asarray(maze.walls).tolist(), roadmap.points.tolist()
     cell, reach = float(maze.cell_m), roadmap.config.connect_m
     looped = options.full or samples <= options.loop_up_to
-    loop = {LOOP: Contestant(lambda: loop_roadmap(points, walls, cell, reach))} if looped else {}
+    loop = {LOOP: Contestant(lambda: loop_roadmap(points, walls, cell, reach), compiles=False)} if looped else {}
     planner = OmplPlanner(maze, max(1, round(2 * len(roadmap.edges) / samples))) if ompl else None
-    fast = {OMPL: Contestant(lambda: planner.build(samples))} if planner else {}
+    fast = {OMPL: Contestant(lambda: planner.build(samples), compiles=False)} if planner else {}
     asked = {OMPL: 2.0} if samples == 1000 else {}
     results.race(f"{samples} samples: build", "ms", Contestant(lambda: build().edges), fast, asked=asked)
     if loop:
@@ -112,7 +114,8 @@ def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: 
     if options.full or samples <= options.table_up_to:
         tabled = samples <= (1000 if options.full else options.loop_table_up_to)
         graph = roadmap.graph
-        both = {LOOP: Contestant(lambda: (loop_roadmap(points, walls, cell, reach), loop_table(graph)))}
+        by_loop = lambda: (loop_roadmap(points, walls, cell, reach), loop_table(graph))  # noqa: E731
+        both = {LOOP: Contestant(by_loop, compiles=False)}
         name = f"{samples} samples: build and table"
         results.race(name, "ms", Contestant(lambda: build().table), both if tabled else {})
     query(maze, samples, roadmap, planner, results)
@@ -121,7 +124,7 @@ def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: 
 def query(maze: Maze, samples: int, roadmap: Roadmap, planner: "OmplPlanner | None", results: Results) -> None:
     """The row of plans between points that are not in the roadmap."""
     ends = building(maze, 100)().points
-    pairs = list(zip(ends[::2], ends[1::2], strict=True))[:10]
+    pairs = list(zip(ends[::2], ends[1::2], strict=True))[: 10 if samples <= 1000 else 3]
     walls, cell, reach = np.asarray(maze.walls).tolist(), float(maze.cell_m), roadmap.config.connect_m
     graph, points = roadmap.graph.copy(), roadmap.points.tolist()
     others = {

@@ -65,7 +65,7 @@ class SacOptions(Options):
     """Robot that learns to walk edges."""
     walks: float = 0.9
     """Share of the held-out edges that it has to walk."""
-    limit_s: float = 1200.0
+    patience_s: float = 1200.0
     """Training time after which it is given up."""
 
 
@@ -129,7 +129,7 @@ def time_to(options: SacOptions, train: Callable[[int], Any], success: Callable[
     """Seconds of training until the success is high enough; looking does not count. Infinite beyond the limit."""
     spent = 0.0
     while success() < options.walks:
-        if spent > options.limit_s:
+        if spent > options.patience_s:
             return float("inf")
         begun = time.perf_counter()
         train(CHUNK)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 from _harness import RESULTS, about
+from transformer import trajectories
 
 from ct_envs import UserError, load_maze, stack_mazes
 from ct_envs.robots import get_robot
@@ -28,7 +29,6 @@ from ct_jax.devices import replicated, sharded
 from ct_jax.fit import Fit, transformer_loss
 from ct_jax.model import sizes
 from ct_jax.presets import Settings, get_preset
-from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
 PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
@@ -130,7 +130,7 @@ def weigh(robot: str, settings: Settings) -> Sizes:
     model = ControlTransformer(settings.model, sizes(robot)[1])
     learner = Fit(transformer_loss(model), settings.fit, settings.model.map_cell_m, get_robot(robot))
     steps = -(-settings.collect.horizon // 256) * 256  # as ``spread`` fills them up
-    data = abstract(robot, SMALL, steps)
+    data = jax.eval_shape(lambda: trajectories(robot, SMALL, steps))
     rtg = jax.ShapeDtypeStruct((SMALL, steps), jnp.float32)
     params = jax.eval_shape(model.init, jax.random.key(0), *sample_inputs(*sizes(robot)))
     state = jax.eval_shape(learner.create, jax.random.key(0), params)
@@ -153,17 +153,6 @@ def weigh(robot: str, settings: Settings) -> Sizes:
             re.findall(r"= .* (?:all-\w+|reduce-scatter|collective-permute)(?:-start)?\(", str(program.as_text()))
         ),
     )
-
-
-def abstract(robot: str, n: int, steps: int) -> Trajectories:
-    """Shapes of n trajectories."""
-    proprio, action = sizes(robot)
-    shape = lambda *more: jax.ShapeDtypeStruct((n, steps, *more), jnp.float32)  # noqa: E731
-    whole = jax.ShapeDtypeStruct((n,), jnp.int32)
-    return Trajectories(
-        position=shape(2), proprio=shape(proprio), action=shape(action), target=shape(action), reward=shape(),
-        learn=shape(), collision=shape(), goal=jax.ShapeDtypeStruct((n, 2), jnp.float32), maze=whole, length=whole,
-    )  # fmt: skip
 
 
 def plan(hosts: int, options: ScaleOptions, settings: Settings, found: Measured, size: Sizes, assumed: Assumed) -> Plan:

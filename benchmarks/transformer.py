@@ -102,24 +102,20 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
     results.add(name, "GFLOP/s", [updates * step_flop / 1e9 / t for t in times])
 
 
-def trajectories(robot: str) -> Trajectories:
+def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Trajectories:
     """Random trajectories of the robot's sizes; a robot that drives in rooms keeps its maps."""
-    rng = np.random.default_rng(0)
     proprio, action = sizes(robot)
-    shape = (TRAJECTORIES, STEPS)
-    normal = lambda *more: rng.normal(size=(*shape, *more)).astype(np.float32)  # noqa: E731
+    keys = iter(jax.random.split(jax.random.key(0), 8))
+    normal = lambda *more: jax.random.normal(next(keys), (n, steps, *more))  # noqa: E731
+    place = lambda *shape: jax.random.uniform(next(keys), (*shape, 2), minval=4.0, maxval=30.0)  # noqa: E731
     seen = {}
     if get_robot(robot).course == "room":
-        seen = {"seen": normal(2), "map_bits": rng.integers(0, 256, (*shape, 157), dtype=np.uint8)}
-    return jax.tree.map(
-        jnp.asarray,
-        Trajectories(
-            position=rng.uniform(4.0, 30.0, (*shape, 2)).astype(np.float32), proprio=normal(proprio),
-            action=np.tanh(normal(action)), target=np.tanh(normal(action)), reward=-np.abs(normal()),
-            learn=np.ones(shape, np.float32), collision=np.zeros(shape, np.float32),
-            goal=rng.uniform(4.0, 30.0, (TRAJECTORIES, 2)).astype(np.float32),
-            maze=np.zeros(TRAJECTORIES, np.int32), length=np.full(TRAJECTORIES, STEPS, np.int32), **seen,
-        ),
+        seen = {"seen": normal(2), "map_bits": jax.random.bits(next(keys), (n, steps, 157), jnp.uint8)}
+    return Trajectories(
+        position=place(n, steps), proprio=normal(proprio),
+        action=jnp.tanh(normal(action)), target=jnp.tanh(normal(action)), reward=-jnp.abs(normal()),
+        learn=jnp.ones((n, steps)), collision=jnp.zeros((n, steps)), goal=place(n),
+        maze=jnp.zeros(n, jnp.int32), length=jnp.full(n, steps, jnp.int32), **seen,
     )  # fmt: skip
 
 
@@ -145,7 +141,7 @@ def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant
     batch["timestep"] = batch["timestep"].long()
     sizes = (window.proprio.shape[-1], window.action.shape[-1], window.rtg.shape[1])
     training = PeerTraining(PeerTransformer(config, *sizes), batch, bf16=bf16)
-    return Contestant(lambda: training.train(updates), updates)
+    return Contestant(lambda: training.train(updates), updates, compiles=False)
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ class Space(Protocol):
         ...
 
     def segment_free(self, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Whether discs of ``radius`` [k] (m) swept from one end to the other, ``ends`` [k, 2, 2] (m), touch nothing."""
+        """Whether discs of ``radius`` [k] (m) swept along segments, by their ``ends`` [k, 2, 2] (m), touch nothing."""
         ...
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:

@@ -5,6 +5,7 @@ import itertools
 import json
 import pathlib
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def results(tmp_path, monkeypatch, **options) -> Results:
 def test_contestants_take_turns_after_a_warm_up(monkeypatch):
     clock = Clock(monkeypatch)
     a, b = clock.contestant("a", 9.0, 1.0, 3.0), clock.contestant("b", 9.0, 2.0, 4.0)
-    assert time_together(a.run, b.run, repeat=2) == [[1.0, 3.0], [2.0, 4.0]]
+    assert time_together(a, b, repeat=2) == [[1.0, 3.0], [2.0, 4.0]]
     assert clock.order == ["a", "b"] * 3
 
 
@@ -57,7 +58,14 @@ def test_contestants_take_turns_after_a_warm_up(monkeypatch):
 def test_a_race_that_takes_long_has_fewer_rounds_but_two(monkeypatch, limit_s, rounds):
     clock = Clock(monkeypatch)
     a, b = clock.contestant("a", 1.0), clock.contestant("b", 4.0)
-    assert time_together(a.run, b.run, repeat=5, limit_s=limit_s) == [[1.0] * rounds, [4.0] * rounds]
+    assert time_together(a, b, repeat=5, limit_s=limit_s) == [[1.0] * rounds, [4.0] * rounds]
+
+
+def test_what_compiles_nothing_has_no_warm_up(monkeypatch):
+    clock = Clock(monkeypatch)
+    a, b = clock.contestant("a", 1.0), replace(clock.contestant("b", 2.0), compiles=False)
+    assert time_together(a, b, repeat=2) == [[1.0] * 2, [2.0] * 2]
+    assert clock.order == ["a"] + ["a", "b"] * 2
 
 
 @pytest.mark.parametrize(("unit", "value", "other"), [("steps/s", 4.0, 1.0), ("ms", 250.0, 1000.0)])
@@ -101,6 +109,15 @@ def test_no_table_was_typed_by_hand(file):
     assert f"python benchmarks/{file.name}" in about(ast.get_docstring(ast.parse(text)))
     if LAST in text:
         assert with_table(text, table_of(json.loads((BENCHMARKS / f"results/{file.stem}.json").read_text()))) == text
+
+
+def test_a_row_has_the_commit_that_make_bench_began_with(tmp_path, monkeypatch):
+    """Not that of the sources into which the benchmarks before it wrote their tables."""
+    monkeypatch.setenv(_harness.COMMIT, "as-it-was")
+    race = results(tmp_path, monkeypatch)
+    race.add("a step", "ms", [1.0])
+    race.finish()
+    assert json.loads((tmp_path / "results/it.json").read_text())[0]["made"]["commit"] == "as-it-was"
 
 
 def test_a_missing_peer_is_said(capsys):
