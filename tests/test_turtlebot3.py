@@ -20,8 +20,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ct_envs import UserError
+from ct_envs.lidar import LIDAR_RANGE_M
 from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, lidar_map
-from ct_envs.turtlebot3 import RADIUS_M, Turtlebot3Config, Turtlebot3Env, load_pybullet
+from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, Turtlebot3Config, Turtlebot3Env, load_pybullet
+from ct_envs.turtlebot3_noise import Belief
 from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, load_world, make_world, random_world, save_world
 from ct_jax.collect import CollectConfig
@@ -593,6 +595,7 @@ INTERRUPTED = """
 import signal
 
 import numpy as np
+from ct_envs.turtlebot3_noise import Belief
 from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
 from ct_envs.turtlebot3_world import make_world
 if __name__ == "__main__":
@@ -762,6 +765,15 @@ def test_noise_is_in_what_is_believed_and_not_in_the_truth(seed):
 
 
 @bullet
+@given(seed=st.integers(0, 1000), level=st.floats(0.1, MAX_NOISE))
+def test_noise_puts_no_obstacle_where_nothing_was_met(seed, level):
+    ranges = np.where(np.arange(360) < 100, 0.6, LIDAR_RANGE_M)
+    scan = Belief(level, np.zeros(2), 0.0, seed).scan(ranges)
+    assert (scan[100:] >= LIDAR_RANGE_M).all()
+    came_back = np.isfinite(scan[:100])
+    assert came_back.any() and (scan[:100][came_back] != 0.6).all()
+
+
 def test_a_pool_with_noise_is_its_simulations_one_by_one():
     config = Turtlebot3Config(noise=1.0)
     with Turtlebot3Pool(3, processes=1, config=config) as noisy, Turtlebot3Env(config) as alone:

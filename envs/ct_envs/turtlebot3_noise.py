@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from ct_envs.lidar import LIDAR_RANGE_M
+
 LIDAR_BLIND_M = 0.12  # nearer than this the LDS-01 measures nothing (its data sheet)
 
 
@@ -60,9 +62,13 @@ class Belief:
         self.yaw_rad += turn
 
     def scan(self, ranges: Float[np.ndarray, "360"]) -> Float[np.ndarray, "360"]:
-        """A scan as the lidar would give it; infinity where nothing came back."""
+        """A scan as the lidar would give it; infinity where nothing came back.
+
+        A beam that met nothing within ``LIDAR_RANGE_M`` stays so: how far it went nobody knows, and an error taken off
+        the limit itself would put an obstacle there.
+        """
         sigma = self._level * np.where(ranges < 0.5, self._noise.near_m, self._noise.far * ranges)
         seen = np.maximum(ranges + sigma * self._rng.standard_normal(ranges.shape), 1e-3)
         lost = self._rng.random(ranges.shape) < self._level * self._noise.dropped
         blind = ranges < min(self._level, 1.0) * LIDAR_BLIND_M
-        return np.where(lost | blind, np.inf, seen)
+        return np.where(lost | blind, np.inf, np.where(ranges < LIDAR_RANGE_M, seen, ranges))
