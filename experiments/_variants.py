@@ -198,10 +198,10 @@ def share(source: Run, run: Run) -> None:
 
 
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
-    """A row with what made it."""
+    """A row with what made its model, or, where it says so itself, with what measured it later."""
     config = read_json(run.folder / "config.json")
     wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
-    return {"variant": variant, "model_seed": run.seed} | row | {"run_wall_s": round(wall_s)} | origin(config)
+    return {"variant": variant, "model_seed": run.seed, "run_wall_s": round(wall_s)} | origin(config) | row
 
 
 def origin(made: dict[str, Any]) -> dict[str, Any]:

@@ -115,10 +115,13 @@ def _sweep(folder: Path, model: Any, settings: Any, *, references: bool) -> dict
 
 
 def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    from _variants import origin
+
     from ct_jax.checkpoint import read_json, write_json
+    from ct_jax.run import provenance
 
     if not file.is_file():
-        write_json(file, measure())
+        write_json(file, measure() | origin(provenance()))
     return read_json(file)
 
 
