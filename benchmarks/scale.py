@@ -161,6 +161,8 @@ def plan(hosts: int, options: ScaleOptions, settings: Settings, found: Measured,
     shares = [k for k in range(1, assumed.gpus + 1) if batch % (k * hosts) == 0]
     each = max(shares, default=0)  # as ``data_mesh`` chooses
     used = max(1, each * hosts)
+    collect = settings.collect
+    maps = math.ceil(max(1, collect.envs // collect.reset_interval) / hosts)  # of a wave, in the process with most
     core_rate = found.collected["value"] / cores_of(found.collected)
     sent = size.parameters + batch * settings.fit.steps * size.step  # gradient and the steps drawn, summed over devices
     inside = 2 * sent / assumed.nvlink_bytes_s * (1 - 1 / max(1, each))
@@ -171,7 +173,7 @@ def plan(hosts: int, options: ScaleOptions, settings: Settings, found: Measured,
         gpu=n * size.trajectory / used + size.state + size.temporary / used,
         host=3 * n * size.trajectory / hosts,  # what was collected, that joined, and that filled up
         rollouts=n / (core_rate * assumed.cores * hosts),
-        roadmaps=n / settings.collect.reset_interval * found.roadmap["value"] / 1e3,
+        roadmaps=n / collect.envs * maps * found.roadmap["value"] / 1e3,
         compute=update_s(found, assumed) / used,
         traffic=inside + between + size.messages * math.ceil(math.log2(max(2, used))) * assumed.message_s,
     )
@@ -208,7 +210,7 @@ def limits(each: Plan, options: ScaleOptions, settings: Settings, assumed: Assum
     gpus = each.hosts * assumed.gpus
     batch = f"`fit.batch` a multiple of the GPUs; {each.used} are used now"
     larger = "a larger batch with a larger learning rate, or fewer hosts: more seeds side by side need no traffic"
-    per_process = "let each process build the roadmaps of its own episodes only; now each builds all of them"
+    waves = "more environments at a time (`collect.envs`): a wave has one roadmap for every `reset_interval` of them"
     rows = "shorter rows, or 16 bits for what is not summed"
     copies = "join and fill up in place, or write waves to disk"
     numbered = "draw the trajectory first, then its step"
@@ -216,7 +218,7 @@ def limits(each: Plan, options: ScaleOptions, settings: Settings, assumed: Assum
     found = [
         Limit(f"pieces of a batch for {gpus} GPUs (asked: one each)", gpus / settings.fit.batch, batch),
         Limit("traffic of an update against its computation", each.traffic / each.compute, larger),
-        Limit("roadmaps of every process against its share of rollouts", each.roadmaps / each.rollouts, per_process),
+        Limit("roadmaps of a process against its share of rollouts", each.roadmaps / each.rollouts, waves),
         Limit("memory of a GPU", each.gpu / assumed.gpu_bytes, rows),
         Limit("memory of a host", each.host / assumed.host_bytes, copies),
         Limit("steps that 32 bits can number, from which windows are drawn", steps / INT32, numbered),
@@ -282,7 +284,7 @@ def table(plans: list[Plan], settings: Settings) -> Iterator[str]:
         "memory of a GPU": [gigabytes(each.gpu) for each in plans],
         "memory of a host, at most": [gigabytes(each.host) for each in plans],
         "collection: rollouts": [duration(each.rollouts) for each in plans],
-        "collection: roadmaps, in every process": [duration(each.roadmaps) for each in plans],
+        "collection: roadmaps, shared by the processes": [duration(each.roadmaps) for each in plans],
         "an update: computation": [duration(each.compute) for each in plans],
         "an update: traffic": [duration(each.traffic) for each in plans],
         f"training, {updates:,} updates": [duration(updates * (each.compute + each.traffic)) for each in plans],
