@@ -9,36 +9,33 @@ has it; it samples its edges every 0.1 m, where ours are exact, and has no table
 
 Last results:
 
-2026-11-24, commit 51962a0, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit b53458e, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
-| what                        | median (min-max)    | unit | against        | its    | times (min-max)     | asked |
-|-----------------------------|---------------------|------|----------------|--------|---------------------|-------|
-| 100 samples: build          | 3.85 (2.92-5.17)    | ms   | OMPL           | 8.74   | 2.36 (1.50-2.79)    |       |
-| 100 samples: build          | 2.28 (1.77-9.6)     | ms   | Python loop    | 6.04   | 2.53 (0.62-3.73)    |       |
-| 100 samples: build and      | 4.38 (3.94-4.89)    | ms   | Python loop    | 38.2   | 8.75 (7.83-9.57)    |       |
-| table                       |                     |      |                |        |                     |       |
-| 100 samples: a plan         | 1.63 (1.43-2.23)    | ms   | Python loop    | 0.449  | 0.31 (0.22-0.32)    |       |
-| 100 samples: a plan         | 1.63 (1.43-2.23)    | ms   | OMPL           | 3.86   | 2.37 (1.82-3.75)    |       |
-| 200 samples: build          | 2.81 (2.43-3.29)    | ms   | OMPL           | 32.9   | 12.32 (9.98-13.57)  |       |
-| 200 samples: build          | 2.79 (2.53-3.01)    | ms   | Python loop    | 20.8   | 7.29 (6.66-8.30)    |       |
-| 200 samples: build and      | 10.5 (9.84-12.4)    | ms   | Python loop    | 209    | 19.92 (16.83-21.42) |       |
-| table                       |                     |      |                |        |                     |       |
-| 200 samples: a plan         | 1.65 (1.59-1.73)    | ms   | Python loop    | 0.955  | 0.58 (0.56-0.60)    |       |
-| 200 samples: a plan         | 1.65 (1.59-1.73)    | ms   | OMPL           | 4.03   | 2.43 (2.27-3.62)    |       |
-| 1000 samples: build         | 13.4 (11.2-14.3)    | ms   | OMPL           | 515    | 39.41 (35.98-45.95) | 2     |
-| 1000 samples: build         | 12.5 (9.35-18.5)    | ms   | Python loop    | 529    | 43.44 (28.40-67.97) | 50    |
-| 1000 samples: build and     | 505 (463-513)       | ms   |                |        |                     |       |
-| table                       |                     |      |                |        |                     |       |
-| 1000 samples: a plan        | 7.86 (7.74-8.22)    | ms   | Python loop    | 18.5   | 2.33 (2.24-2.51)    |       |
-| 1000 samples: a plan        | 7.86 (7.74-8.22)    | ms   | OMPL           | 4.81   | 0.61 (0.56-0.62)    |       |
-| 5000 samples: build         | 637 (532-742)       | ms   | OMPL           | 12,055 | 19.46 (16.27-22.64) |       |
-| 5000 samples: a plan        | 191 (187-195)       | ms   | Python loop    | 587    | 3.08 (2.80-3.35)    |       |
-| 5000 samples: a plan        | 191 (187-195)       | ms   | OMPL           | 331    | 1.73 (1.63-1.83)    |       |
-| growth: an edge at 5000     | 0.144 (0.129-0.176) | µs   | an edge at 200 | 1.26   | 8.65 (7.29-11.09)   | 0.769 |
-| samples                     |                     |      |                |        |                     |       |
+| what                         | median (min-max)    | unit | against        | its   | times (min-max)     | asked |
+|------------------------------|---------------------|------|----------------|-------|---------------------|-------|
+| 100 samples: build           | 1.78 (1.51-1.95)    | ms   | OMPL           | 6.83  | 4.23 (3.30-4.68)    |       |
+| 100 samples: build           | 1.76 (1.62-1.82)    | ms   | Python loop    | 4.57  | 2.63 (2.56-4.20)    |       |
+| 100 samples: build and table | 3.38 (3.18-3.52)    | ms   | Python loop    | 29.4  | 8.63 (8.45-9.45)    |       |
+| 100 samples: a plan          | 1.5 (1.47-1.56)     | ms   | Python loop    | 0.359 | 0.24 (0.24-0.25)    |       |
+| 100 samples: a plan          | 1.5 (1.47-1.56)     | ms   | OMPL           | 1.35  | 0.90 (0.53-1.51)    |       |
+| 200 samples: build           | 2.28 (2.07-2.39)    | ms   | OMPL           | 26.4  | 11.53 (11.06-12.82) |       |
+| 200 samples: build           | 2.03 (1.87-2.12)    | ms   | Python loop    | 16.7  | 8.35 (8.00-8.89)    |       |
+| 200 samples: build and table | 9.72 (8.59-10)      | ms   | Python loop    | 168   | 17.48 (16.75-19.53) |       |
+| 200 samples: a plan          | 1.8 (1.7-2.04)      | ms   | Python loop    | 0.756 | 0.43 (0.38-0.45)    |       |
+| 200 samples: a plan          | 1.8 (1.7-2.04)      | ms   | OMPL           | 12.4  | 6.87 (4.08-15.55)   |       |
+| 1000 samples: build          | 9.97 (8.41-11.3)    | ms   | OMPL           | 485   | 49.37 (43.05-57.44) | 2     |
+| 1000 samples: build          | 9.48 (9.15-10.5)    | ms   | Python loop    | 434   | 45.61 (41.09-50.87) | 50    |
+| 1000 samples: build and      | 386 (370-393)       | ms   |                |       |                     |       |
+| table                        |                     |      |                |       |                     |       |
+| 1000 samples: a plan         | 7.08 (7.07-7.15)    | ms   | Python loop    | 12.5  | 1.76 (1.72-1.77)    |       |
+| 1000 samples: a plan         | 7.08 (7.07-7.15)    | ms   | OMPL           | 118   | 16.53 (15.59-26.40) |       |
+| 5000 samples: build          | 203 (189-212)       | ms   |                |       |                     |       |
+| 5000 samples: a plan         | 172 (171-173)       | ms   | Python loop    | 636   | 3.69 (3.66-3.73)    |       |
+| growth: an edge at 5000      | 0.162 (0.155-0.162) | µs   | an edge at 200 | 1.3   | 8.03 (7.32-11.54)   | 0.769 |
+| samples                      |                     |      |                |       |                     |       |
 """
 
 import math

@@ -11,19 +11,19 @@ On a GPU the same in bfloat16 and with cuDNN's attention.
 
 Last results:
 
-2026-11-24, commit d6b286a, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit b53458e, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
-| what                | median (min-max)    | unit    | against                | its   | times (min-max)  | asked |
-|---------------------|---------------------|---------|------------------------|-------|------------------|-------|
-| turtlebot3, float32 | 9.98 (8.39-10.4)    | steps/s | float32 matrix product | 19.9  | 0.50 (0.44-0.50) |       |
-| turtlebot3, float32 | 9.98 (8.39-10.4)    | steps/s | Hugging Face, torch    | 8.19  | 1.22 (1.03-1.27) | 1.2   |
-| turtlebot3, float32 | 93.8 (78.9-98.1)    | GFLOP/s |                        |       |                  |       |
-| ant, float32        | 0.152 (0.151-0.153) | steps/s | float32 matrix product | 0.245 | 0.62 (0.58-0.66) |       |
-| ant, float32        | 0.152 (0.151-0.153) | steps/s | Hugging Face, torch    | 0.191 | 0.80 (0.78-0.81) | 1.2   |
-| ant, float32        | 104 (104-105)       | GFLOP/s |                        |       |                  |       |
+| what                | median (min-max)   | unit    | against                | its   | times (min-max)  | asked |
+|---------------------|--------------------|---------|------------------------|-------|------------------|-------|
+| turtlebot3, float32 | 13.3 (12.4-14.4)   | steps/s | float32 matrix product | 32.9  | 0.42 (0.41-0.43) |       |
+| turtlebot3, float32 | 13.3 (12.4-14.4)   | steps/s | Hugging Face, torch    | 11.6  | 1.15 (1.07-1.57) | 1.2   |
+| turtlebot3, float32 | 124 (116-135)      | GFLOP/s |                        |       |                  |       |
+| ant, float32        | 0.259 (0.22-0.299) | steps/s | float32 matrix product | 0.364 | 0.72 (0.58-0.86) |       |
+| ant, float32        | 0.259 (0.22-0.299) | steps/s | Hugging Face, torch    | 0.247 | 1.14 (0.73-1.54) | 1.2   |
+| ant, float32        | 178 (151-205)      | GFLOP/s |                        |       |                  |       |
 """
 
 from dataclasses import dataclass
