@@ -164,8 +164,9 @@ def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     points = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
     pairs = _new_pairs(points, known, roadmap.config.connect_m)
     # Between samples the margin is kept; to given points only the radius.
-    first, second = pairs.T
-    clear = roadmap.radius_m + roadmap.config.margin_m * (np.maximum(first, second) < roadmap.config.samples)
+    clear = np.full(len(pairs), roadmap.radius_m, np.float32)
+    if roadmap.config.margin_m:
+        clear += np.float32(roadmap.config.margin_m) * (pairs[:, 1] < roadmap.config.samples)
     free = as_space(roadmap.maze).segment_free(points.take(pairs, 0), clear)
     return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs.take(np.flatnonzero(free), 0)]))
 
@@ -212,7 +213,7 @@ class MazeSpace:
         return _sample_points(rng, self.maze, radius, n)
 
 
-_BLOCK = 16_384  # most edges that are checked at once: they stay in the processor's cache and share one program
+_BLOCK = 32_768  # most edges that are checked at once: they stay in the processor's cache and share one program
 
 
 def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
@@ -221,7 +222,8 @@ def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, ra
     for begin in range(0, max(len(ends), 1), _BLOCK):
         block, room = ends[begin : begin + _BLOCK], radius[begin : begin + _BLOCK]
         n = len(block)
-        more = max(1024, 1 << (n - 1).bit_length()) - n  # to a power of two, so that few programs serve all roadmaps
+        whole = max(1024, 1 << (n - 1).bit_length())  # or three quarters of it: few programs serve all roadmaps
+        more = (whole if n > 3 * whole // 4 else 3 * whole // 4) - n
         if more:
             block, room = np.pad(block, ((0, more), (0, 0), (0, 0))), np.pad(room, (0, more))
         found.append([(flag, n) for flag in check(ends=block, radius=room)])
