@@ -26,7 +26,7 @@ _PAIRS = 200  # starts and goals that are tried in one world
 _APART_M = 1.0  # least distance of start and goal
 _LOOK = 24  # waypoints that are looked at first: mostly one of the best is in sight
 _NUDGE_M = 1e-3
-_EXPLORER_MARGIN_M = 0.05  # kept to what was seen, half a cell of its grid included
+_CLEAR_M = 0.05  # that the explorer keeps to what it saw, half a cell of its grid included
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,14 @@ class RoomConfig:
     """The rooms of training and evaluation."""
 
     density: float = 1.0  # of obstacles in training: 1 is what the published numbers are measured in
+    densest: float | None = None  # with this, each room's density is its own, between the two
     noise: float = 0.0  # level of sensor and motion noise in training; 1 is that of a real robot
     worlds: int = 20  # rooms of the evaluation (paper)
+
+    @property
+    def densities(self) -> tuple[float, float]:
+        """Between which the densities of the rooms of training are drawn."""
+        return self.density, self.density if self.densest is None else self.densest
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +66,12 @@ class Room:
         raise UserError("the roadmap joins no start and goal in this world; use fewer obstacles or more samples")
 
 
-def make_room(key: jax.Array, prm: PrmConfig, *, density: float = 1.0) -> Room:
-    """A random world and its roadmap, by their key; ``density`` as for ``clutter``."""
+def make_room(key: jax.Array, prm: PrmConfig, *, densities: tuple[float, float] = (1.0, 1.0)) -> Room:
+    """A random world and its roadmap, by their key; its density, as for ``clutter``, is uniform between the two."""
     world_key, map_key = jax.random.split(key)
     seed = tuple(np.asarray(jax.random.key_data(world_key)).astype(np.uint32).tolist())
-    world = clutter(seed, density)
+    low, high = densities
+    world = clutter(seed, low + (high - low) * np.random.default_rng((*seed, 3)).random())
     return Room(world, build_roadmap(map_key, world, radius_m=RADIUS_M, config=prm))
 
 
@@ -176,7 +183,7 @@ AnyGuide = WayGuide | ShortcutGuide | ExplorerGuide
 _GUIDES: dict[str, Callable[[PrmConfig], AnyGuide]] = {
     "roadmap": lambda prm: WayGuide(),
     "shortcut": lambda prm: ShortcutGuide(prm.margin_m, prm.connect_m),
-    "explorer": lambda prm: ExplorerGuide(RADIUS_M + _EXPLORER_MARGIN_M),
+    "explorer": lambda prm: ExplorerGuide(RADIUS_M + _CLEAR_M, prm.margin_m),
 }
 
 
@@ -198,13 +205,14 @@ class Wave(NamedTuple):
 
 
 def draw_wave(
-    key: jax.Array, first: int, config: CollectConfig, prm: PrmConfig, *, n: int, density: float = 1.0
-) -> Wave:
+    key: jax.Array, first: int, config: CollectConfig, prm: PrmConfig, *, n: int,
+    densities: tuple[float, float] = (1.0, 1.0),
+) -> Wave:  # fmt: skip
     """Episodes ``first`` to ``first + n - 1``, a new room every L. Each depends on the key and its number alone."""
     room_key, episode_key = jax.random.split(key)
     numbers = range(first, first + n)
     which = [number // config.reset_interval for number in numbers]
-    rooms = {i: make_room(jax.random.fold_in(room_key, i), prm, density=density) for i in sorted(set(which))}
+    rooms = {i: make_room(jax.random.fold_in(room_key, i), prm, densities=densities) for i in sorted(set(which))}
     episodes = []
     for number, room in zip(numbers, which, strict=True):
         seed = int(jax.random.bits(jax.random.fold_in(episode_key, number)))
@@ -233,7 +241,7 @@ def collect(
     config: CollectConfig,
     prm: PrmConfig,
     *,
-    density: float = 1.0,
+    densities: tuple[float, float] = (1.0, 1.0),
     controller: DifferentialDrive = DifferentialDrive(),
     on_progress: Callable[[int, int], None] = lambda successes, episodes: None,
     keep: Callable[[Callable[[int], Any]], Callable[[int], Any]] = lambda wave: wave,
@@ -243,7 +251,7 @@ def collect(
     ``config.envs`` episodes are driven at a time; ``config.horizon`` is the pool's business.
 
     Args:
-        density: of obstacles, as for ``clutter``.
+        densities: of obstacles, as for ``make_room``.
         on_progress: told (successes, episodes) so far.
         keep: see ``keeping``.
 
@@ -258,7 +266,7 @@ def collect(
     guide = make_guide(config.guide, prm)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray]:
-        drawn = draw_wave(key, first, config, prm, n=config.envs, density=density)
+        drawn = draw_wave(key, first, config, prm, n=config.envs, densities=densities)
         drives = drive_guided(pool, drawn, guide, controller, noise=config.noise)
         return to_trajectories(drives), np.array([each.success for each in drives])
 

@@ -18,6 +18,7 @@ from ct_envs.turtlebot3_pool import Frame
 
 _NEAR = 0.15  # share of a straight way that may be blocked: the robot may stand too near to an obstacle already
 _DEAR = 30.0  # how much longer a way through cells is that are too near to an obstacle: a last resort
+_TIGHT = 3.0  # the same within the margin
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class ExplorerGuide:
     """Optimistic replanning on the lidar's grid, for the slots of a pool."""
 
     clear_m: float  # kept between the robot's middle and what it saw
+    margin_m: float = 0.0  # kept beyond that where the way round is not much longer
     cell_m: float = LIDAR_CELL_M
     side_m: float = 14.0  # of the grid: from a start at one corner of a room it reaches the other
     every: int = 5  # steps between two plans
@@ -78,17 +80,22 @@ class ExplorerGuide:
         ends = np.clip(np.stack([self._cell(chart, position), self._cell(chart, chart.goal)]), 0, n - 1)
         low, high = np.maximum(ends.min(0) - reach, 0), np.minimum(ends.max(0) + reach + 1, n)
         part = chart.occupied[low[1] : high[1], low[0] : high[0]]
-        blocked = _distance(part, self.cell_m) < self.clear_m
-        way = _way(blocked, *(ends - low))
+        away = _distance(part, self.cell_m)
+        cost = np.where(away < self.clear_m, _DEAR, np.where(away < self.clear_m + self.margin_m, _TIGHT, 1.0))
+        way = _way(cost, *(ends - low))
         if len(way) < 2:
             return chart.goal
         points = chart.origin + (way + low + 0.5) * self.cell_m
         points[-1] = chart.goal
-        close = points[1:][np.linalg.norm(points[1:] - position, axis=-1) <= self.look_m]
+        near = np.linalg.norm(points[1:] - position, axis=-1) <= self.look_m
+        close = points[1:][: int(np.argmin(np.append(near, False)))]
         share = np.linspace(0.0, 1.0, 25)[:, None, None]
         column, row = np.moveaxis(self._cell(chart, position + share * (close - position)) - low, -1, 0)
-        inside = np.clip(row, 0, len(blocked) - 1), np.clip(column, 0, blocked.shape[1] - 1)
-        free = np.flatnonzero(~(blocked[inside] & (share[..., 0] > _NEAR)).any(0))
+        inside = np.clip(row, 0, len(cost) - 1), np.clip(column, 0, cost.shape[1] - 1)
+        # A straight way may be as tight as the one it cuts short, and no tighter.
+        straight = np.where(share[..., 0] > _NEAR, cost[inside], 1.0).max(0)
+        tight = np.maximum.accumulate(cost[way[1:, 1], way[1:, 0]])[: len(close)]
+        free = np.flatnonzero(straight <= tight)
         return close[free[-1]] if len(free) else points[1]
 
     def _cell(self, chart: Charted, points: np.ndarray) -> np.ndarray:
@@ -103,20 +110,19 @@ def _distance(occupied: np.ndarray, cell_m: float) -> np.ndarray:
     return ndimage.distance_transform_edt(~occupied, sampling=cell_m)  # pyright: ignore[reportReturnType]
 
 
-def _way(blocked: np.ndarray, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def _way(cost: np.ndarray, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Cells [k, 2] (column, row) of a shortest way."""
-    first, last = (int(row * blocked.shape[1] + column) for column, row in (start, goal))
-    _, before = dijkstra(_grid(blocked), indices=last, return_predecessors=True)
+    first, last = (int(row * cost.shape[1] + column) for column, row in (start, goal))
+    _, before = dijkstra(_grid(cost), indices=last, return_predecessors=True)
     way = [first]
     while way[-1] != last and before[way[-1]] >= 0:
         way.append(int(before[way[-1]]))
-    return np.stack(np.unravel_index(way, blocked.shape)[::-1], -1)
+    return np.stack(np.unravel_index(way, cost.shape)[::-1], -1)
 
 
-def _grid(blocked: np.ndarray) -> csr_array:
-    """The 8-connected graph of a grid; entering a blocked cell is dear."""
-    index = np.arange(blocked.size).reshape(blocked.shape)
-    cost = np.where(blocked, _DEAR, 1.0)
+def _grid(cost: np.ndarray) -> csr_array:
+    """The 8-connected graph of a grid, by what a way through each cell costs (1 where it is free)."""
+    index = np.arange(cost.size).reshape(cost.shape)
     rows, columns, weights = [], [], []
     for here, there, length in (
         (np.s_[:, :-1], np.s_[:, 1:], 1.0), (np.s_[:-1, :], np.s_[1:, :], 1.0),
@@ -128,7 +134,7 @@ def _grid(blocked: np.ndarray) -> csr_array:
             columns.append(index[b].ravel())
             weights.append(weight)
     entries = np.concatenate(rows), np.concatenate(columns)
-    return csr_array((np.concatenate(weights), entries), shape=(blocked.size,) * 2)
+    return csr_array((np.concatenate(weights), entries), shape=(cost.size,) * 2)
 
 
 def _beam_ends(frame: Frame) -> Float[np.ndarray, "N 360 2"]:

@@ -57,7 +57,7 @@ def recover(
     collecting: CollectConfig,
     prm: PrmConfig,
     *,
-    density: float = 1.0,
+    densities: tuple[float, float] = (1.0, 1.0),
     controller: DifferentialDrive = DifferentialDrive(),
     on_progress: Callable[[int, int], None] = lambda recoveries, episodes: None,
     keep: Callable[[Callable[[int], Any]], Callable[[int], Any]] = lambda wave: wave,
@@ -67,7 +67,7 @@ def recover(
     Args:
         pool: its horizon bounds failure and recovery together.
         collecting: whose starts, guide, reset interval and number of episodes at a time are used.
-        density: of obstacles, as for ``clutter``.
+        densities: of obstacles, as for ``make_room``.
         keep: see ``collect_turtlebot3.keeping``.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, prm)
@@ -75,7 +75,7 @@ def recover(
     supervised = Supervised(policy, Given(), config)  # pyright: ignore[reportArgumentType]
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
-        drawn = draw_wave(key, first, collecting, prm, n=collecting.envs, density=density)
+        drawn = draw_wave(key, first, collecting, prm, n=collecting.envs, densities=densities)
         driver = SupervisedDriver(supervised, planner, jax.random.fold_in(key, first))
 
         def begin(frame: Frame) -> tuple[Any, Any, int]:

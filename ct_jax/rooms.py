@@ -64,7 +64,7 @@ class RoomCourse:
         settings = self.run.settings
         with self._pool(settings.collect.horizon) as pool:
             return collect(
-                key, pool, settings.collect, settings.prm, density=self.config.density, controller=controller,
+                key, pool, settings.collect, settings.prm, densities=self.config.densities, controller=controller,
                 on_progress=on_progress, keep=keeping(folder, mend=self.run.mend("collect")),
             )  # fmt: skip
 
@@ -76,7 +76,7 @@ class RoomCourse:
         settings = self.run.settings
         with self._pool(settings.recover.patience + settings.collect.horizon) as pool:
             return recover(
-                key, pool, policy, settings.recover, settings.collect, settings.prm, density=self.config.density,
+                key, pool, policy, settings.recover, settings.collect, settings.prm, densities=self.config.densities,
                 controller=controller, on_progress=on_progress,
                 keep=keeping(folder, mend=self.run.mend("finetune")),
             )  # fmt: skip

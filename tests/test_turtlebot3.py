@@ -38,6 +38,7 @@ from ct_jax.collect_turtlebot3 import (
     make_room,
 )
 from ct_jax.drive import to_trajectories
+from ct_jax.explorer_turtlebot3 import Charted, ExplorerGuide
 from ct_jax.prm import NoPath, PrmConfig, build_roadmap
 from ct_jax.prm import Path as Way
 from ct_jax.trajectories import unpack_maps
@@ -728,13 +729,45 @@ def test_a_goal_never_reached_is_an_error_and_no_hang():
 
 
 def test_rooms_and_guides():
-    one, again, dense = (make_room(jax.random.key(3), PRM, density=density) for density in (1.0, 1.0, 2.0))
+    one, again, dense = (make_room(jax.random.key(3), PRM, densities=(d, d)) for d in (1.0, 1.0, 2.0))
     np.testing.assert_array_equal(one.world.boxes, again.world.boxes)
     np.testing.assert_array_equal(one.roadmap.points, again.roadmap.points)
     assert dense.world.covered() > one.world.covered()
     np.testing.assert_array_equal(clutter(5, 1.0).boxes, random_world(5).boxes)
     with pytest.raises(UserError, match="guides: roadmap, shortcut, explorer"):
         make_guide("luck", PRM)
+
+
+def test_rooms_of_many_densities():
+    factors = []
+    for number in range(12):
+        key = jax.random.key(number)
+        drawn, sparse, dense = (
+            make_room(key, PRM, densities=d).world.covered() for d in ((0.5, 2), (0.5, 0.5), (2, 2))
+        )
+        assert sparse - 0.01 <= drawn <= dense + 0.01  # to half an obstacle
+        factors.append((drawn - sparse) / (dense - sparse))
+    assert min(factors) < 0.3 and max(factors) > 0.7
+
+
+@given(SEEDS)
+@settings(max_examples=10)
+def test_a_margin_keeps_the_explorer_away_where_there_is_room(seed):
+    """Past a gap of one cell straight on, with a wide way round; and through it where there is no other."""
+    wide, cell = bool(seed % 2), 0.08
+    n = round(14 / cell)
+    occupied = np.zeros((n, n), bool)
+    occupied[n // 2 + 8] = True
+    gap = n // 2 + seed % 5 - 2
+    occupied[n // 2 + 8, gap - 2 : gap + 3] = False
+    occupied[n // 2 + 8, gap + 6 : gap + 18 if wide else 0] = False
+    position, goal = np.array([0.0, 0.0]), np.array([0.0, 1.6])
+    chart = Charted(np.full(2, -7.0), goal, occupied)
+    bold, wary = (ExplorerGuide(RADIUS_M + 0.05, margin, look_m=5.0)._plan(chart, position) for margin in (0.0, 0.2))
+    if wide:
+        assert wary[0] > bold[0] + 0.1
+    else:
+        np.testing.assert_allclose(wary[0], bold[0], atol=0.2)
 
 
 # ---------------------------------------------------------------------------------------------------------- noise
