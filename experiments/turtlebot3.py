@@ -3,9 +3,10 @@
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
 With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``, and
-``cpu-ct`` before its fine-tuning), the same trained with noise, and planner and explorer beside them. The lifted ones
-of the first seed then meet rooms of 0.5 to 2 times the density of training, sensors and motion of 0 to 2 times a real
-robot's errors, and the paper's seven pairs in one fixed room. Everything finished is kept: the same command goes on.
+``cpu-ct`` before its fine-tuning), the same trained with noise (``noise``) or in rooms of many densities (``dense``),
+and planner and explorer beside them. The lifted ones of the first seed then meet rooms of 0.5 to 2 times the published
+density, sensors and motion of 0 to 2 times a real robot's errors, and the paper's seven pairs in one fixed room.
+Everything finished is kept: the same command goes on.
 Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other seeds and variants stay, and the plots
 ``docs/turtlebot3-density.png`` and ``-noise.png``.
 """
@@ -20,7 +21,8 @@ RESULTS = ROOT / "experiments" / "results"
 DENSITIES = (0.5, 1.5, 2.0)  # besides 1, in which every variant is measured
 LEVELS = (0.5, 1.0, 2.0)  # besides 0
 SEVEN_LEVELS = (0.0, 1.0)
-SWEPT = ("cpu-ct", "cpu", "noise")  # variants that meet other densities and levels of noise
+SWEEPS = ("density", "noise", "seven")
+SWEPT = {"cpu-ct": SWEEPS, "cpu": SWEEPS, "noise": ("noise", "seven"), "dense": ("density",)}  # what variants meet
 SWEPT_PAIRS = 10  # in each room of those
 REFERENCES = ("planner", "explorer")
 
@@ -34,7 +36,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu, noise. By default all."""
+    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu, noise, dense. By default all."""
     sweeps: bool = True
     """Also other densities, levels of noise, and the seven pairs."""
     out: Path = Path("runs/turtlebot3")
@@ -63,6 +65,7 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
             "cpu-ct": replace(lifted, rounds=0),
             "cpu": lifted,
             "noise": replace(lifted, rooms=replace(lifted.rooms, noise=1.0)),
+            "dense": replace(lifted, rooms=replace(lifted.rooms, density=min(DENSITIES), densest=max(DENSITIES))),
         }
     for name in chosen:
         if name not in known:
@@ -83,17 +86,19 @@ def run_all(options: Options) -> Path:
         "turtlebot3", Plan(variants), preset=options.preset, seeds=options.seeds, out=options.out,
         keep=lambda rows: write_results(file, {"rows": rows}),
     )  # fmt: skip
-    swept = [name for name in variants if options.sweeps and (name in SWEPT or name == options.preset)]
-    for name in swept:
+    swept = {name: SWEPT.get(name, SWEEPS) for name in variants if name in SWEPT or name == options.preset}
+    for name, kinds in swept.items() if options.sweeps else ():
         folder = options.out / f"{name}-{options.seeds[0]}"
         run = Run(folder, "turtlebot3", options.preset, variants[name], {}, {}, options.seeds[0], "auto")
-        found = _sweep(folder, load_model(str(folder)), variants[name], references=name == swept[0])
+        found = _sweep(folder, load_model(str(folder)), variants[name], kinds, references=name == next(iter(swept)))
         write_results(file, {kind: [label(run, name, row) for row in rows] for kind, rows in found.items()})
     return file
 
 
-def _sweep(folder: Path, model: Any, settings: Any, *, references: bool) -> dict[str, list[dict[str, Any]]]:
-    """Other densities, levels of noise, and the seven pairs."""
+def _sweep(
+    folder: Path, model: Any, settings: Any, kinds: tuple[str, ...], *, references: bool
+) -> dict[str, list[dict[str, Any]]]:
+    """Those kinds of: other densities, levels of noise, and the seven pairs."""
     from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 
     kept, seed = folder / "sweeps", settings.pairs_seed
@@ -111,6 +116,7 @@ def _sweep(folder: Path, model: Any, settings: Any, *, references: bool) -> dict
             for at in points
         ]
         for kind, (points, measure) in measures.items()
+        if kind in kinds
     }
 
 
@@ -169,7 +175,7 @@ def main() -> int:
         options = tyro.cli(Options, description=__doc__)
         file = run_all(options)
         found = read_json(file)
-        for axis, label in (("density", "density of obstacles / that of training"), ("noise", "level of noise")):
+        for axis, label in (("density", "density of obstacles / the published"), ("noise", "level of noise")):
             if axis in found:
                 swept = {line_of(row) for row in found[axis]}
                 rows = found[axis] + [row for row in found["rows"] if line_of(row) in swept]

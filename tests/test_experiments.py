@@ -112,8 +112,10 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
 
 def test_the_turtlebots_rows_share_what_they_can():
     known = variants_for("cpu")
-    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu", "noise"]
+    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu", "noise", "dense"]
     assert replace(known["cpu"], rounds=0) == known["cpu-ct"]
+    densities = [known[name].rooms.densities for name in ("cpu", "dense")]  # pyright: ignore
+    assert densities == [(1.0, 1.0), (0.5, 2.0)]
     ct, bc, fct = (known[name] for name in ("ct", "bc-ct", "f-ct"))
     assert replace(fct, rounds=0) == ct and fct.rounds == 1 and fct.recover.keep == "separate"
     assert replace(bc, model=ct.model) == ct and not bc.model.returns
