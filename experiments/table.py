@@ -90,8 +90,7 @@ def room_table(results: dict[str, Any]) -> list[str]:
     together: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
     sweeps = [*results.get("density", []), *results.get("noise", [])]
     for row in results["rows"] + sweeps:
-        name = row["variant"] if row["method"] == "ct" else row["method"]
-        together.setdefault((name, row["density"], row["noise"]), []).append(row)
+        together.setdefault((line_of(row), row["density"], row["noise"]), []).append(row)
     for (name, density, noise), rows in together.items():
         spl = sum(row["spl"] for row in rows) / len(rows)
         name = name if len(rows) == 1 else f"{name}, {len(rows)} models"
@@ -107,6 +106,11 @@ def room_table(results: dict[str, Any]) -> list[str]:
     on += f" ({sweeps[0]['pairs']} where density or noise is another)" if sweeps else ""
     note = f"{commands(rows + sweeps)}; {on}; 95 % intervals; {origin(rows + sweeps)}."
     return [*lines, "", note]
+
+
+def line_of(row: dict[str, Any]) -> str:
+    """The model or reference to which a row of the rooms belongs."""
+    return row["variant"] if row["method"] == "ct" else row["method"]
 
 
 def transfer_table(results: dict[str, Any]) -> list[str]:

@@ -24,7 +24,6 @@ SEVEN_LEVELS = (0.0, 1.0)
 SWEEPS = ("density", "noise", "seven")
 SWEPT = {"cpu-ct": SWEEPS, "cpu": SWEEPS, "noise": ("noise", "seven"), "dense": ("density",)}  # what variants meet
 SWEPT_PAIRS = 10  # in each room of those
-REFERENCES = ("planner", "explorer")
 
 
 @dataclass(frozen=True)
@@ -99,6 +98,7 @@ def _sweep(
     folder: Path, model: Any, settings: Any, kinds: tuple[str, ...], *, references: bool
 ) -> dict[str, list[dict[str, Any]]]:
     """Those kinds of: other densities, levels of noise, and the seven pairs."""
+    from ct_jax.evaluate import GUIDED
     from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 
     kept, seed = folder / "sweeps", settings.pairs_seed
@@ -112,7 +112,7 @@ def _sweep(
     return {
         kind: [
             _kept(kept / f"{kind}-{at}-{method}.json", lambda m=method, a=at, f=measure: f(m, a))
-            for method in ("ct", *REFERENCES[: 2 * references])
+            for method in ("ct", *(GUIDED if references else ()))
             for at in points
         ]
         for kind, (points, measure) in measures.items()
@@ -131,14 +131,10 @@ def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return read_json(file)
 
 
-def line_of(row: dict[str, Any]) -> str:
-    """The plots' line to which a row belongs."""
-    return row["variant"] if row["method"] == "ct" else row["method"]
-
-
 def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) -> None:
     """Plot success against ``axis``, a line for each variant and reference, with 95 % intervals of all its models."""
     from matplotlib.figure import Figure
+    from table import line_of
 
     from ct_jax.evaluate import wilson_of
 
@@ -167,6 +163,7 @@ def main() -> int:
     """Run the experiment from the command line; returns the exit status."""
     import tyro
     from _variants import show_results
+    from table import line_of
 
     from ct_jax.checkpoint import read_json
     from ct_jax.cli import guarded
