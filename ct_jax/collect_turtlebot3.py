@@ -1,6 +1,5 @@
 """Collecting planner-guided episodes of the Turtlebot3 (paper, Algorithm 3 and sec. IV-D), on a pool of simulations."""
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import networkx as nx
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from jaxtyping import Float
 
 from ct_envs import UserError
-from ct_envs.lidar import LIDAR_RANGE_M
 from ct_envs.turtlebot3 import RADIUS_M, to_heading
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
@@ -55,21 +50,6 @@ class Room:
 
     world: World
     roadmap: Roadmap
-
-    @property
-    def n_obstacles(self) -> int:
-        """Boxes and cylinders."""
-        return len(self.world.boxes) + len(self.world.cylinders)
-
-    @functools.cached_property
-    def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the roadmap's points, the pairs [m, 2] that would be joined in an empty room, their distances [m] (m), and
-        which obstacles are in between, bool [m, O]."""
-        points, config = self.roadmap.points, self.roadmap.config
-        pairs = cKDTree(points).query_pairs(config.connect_m, output_type="ndarray")
-        a, b = points[pairs[:, 0]], points[pairs[:, 1]]
-        blocks = self.world.segment_distances(a, b) < RADIUS_M + config.margin_m
-        return pairs, np.linalg.norm(a - b, axis=-1), blocks
 
     def draw(self, rng: np.random.Generator, starts: str = "vertices") -> tuple[np.ndarray, np.ndarray]:
         """A start and a goal [2] (m) that the roadmap joins. Raises UserError if it joins no two."""
@@ -162,7 +142,7 @@ class ShortcutGuide:
 
     def _field(self, episode: Episode, room: Room) -> Field:
         goal, points = np.asarray(episode.goal), room.roadmap.points
-        seen = self.sees(room.world, goal, points)
+        seen = self._sees(room.world, goal, points)
         away = np.where(seen, np.linalg.norm(points - goal, axis=-1), np.inf)
         to_go = (np.asarray(room.roadmap.table.distance) + away).min(1)
         return Field(room.world, np.concatenate([points, goal[None]]), np.append(to_go, 0.0), goal)
@@ -186,12 +166,12 @@ class ShortcutGuide:
         # Beside a waypoint that is passed, the way on may have a little less room than it has from there.
         slack = self.waypoint_tolerance_m if passed.any() else 0.0
         for some in (best[:_LOOK], best[_LOOK:]):
-            free = np.flatnonzero(self.sees(field.world, position, field.points[some], slack))
+            free = np.flatnonzero(self._sees(field.world, position, field.points[some], slack))
             if len(free):
                 return field.points[some[free[0]]]
         return field.target
 
-    def sees(self, world: World, position: np.ndarray, points: np.ndarray, slack_m: float = 0.0) -> np.ndarray:
+    def _sees(self, world: World, position: np.ndarray, points: np.ndarray, slack_m: float = 0.0) -> np.ndarray:
         """Whether the ways from a position [2] to points [k, 2] (m) are free; one that is near an obstacle already may
         stay as near."""
         ends = np.minimum(world.clearance(points), float(world.clearance(position))) - _NUDGE_M
@@ -199,64 +179,10 @@ class ShortcutGuide:
         return world.segment_free(np.stack(np.broadcast_arrays(position, points), -2), room)
 
 
-class Scouted(NamedTuple):
-    """What one robot has found of its room, and its roadmap as it is as far as it knows."""
-
-    room: Room
-    found: Bool[np.ndarray, "O"]  # obstacles
-    field: Field
-
-
-@dataclass(frozen=True)
-class ScoutGuide:
-    """``ShortcutGuide`` for a robot that has to find the obstacles: it learns of one within the lidar's range, whether
-    or not another hides it, and until then drives as if there was none. So it knows hardly more than its pupil."""
-
-    shortcut: ShortcutGuide
-
-    def init(self, frame: Frame, episodes: Sequence[Episode], rooms: Sequence[Room]) -> tuple[Scouted, ...]:
-        """What is seen from the starts."""
-        return tuple(
-            self._update(room, np.zeros(room.n_obstacles, bool), np.asarray(each.goal), frame.position[slot])
-            for slot, (each, room) in enumerate(zip(episodes, rooms, strict=True))
-        )
-
-    def waypoint(self, memory: tuple[Scouted, ...], frame: Frame) -> tuple[np.ndarray, tuple[Scouted, ...]]:
-        """Vectors to the robots' waypoints [N, 2] (m)."""
-        memory = tuple(
-            scouted if frame.done[slot] else self._look(scouted, frame.position[slot])
-            for slot, scouted in enumerate(memory)
-        )
-        fields = tuple(scouted.field for scouted in memory)
-        vectors, fields = self.shortcut.waypoint(fields, frame)
-        return vectors, tuple(scouted._replace(field=field) for scouted, field in zip(memory, fields, strict=True))
-
-    def _look(self, scouted: Scouted, position: np.ndarray) -> Scouted:
-        found = scouted.found | (scouted.room.world.distances(position) < LIDAR_RANGE_M)
-        if (found == scouted.found).all():
-            return scouted
-        updated = self._update(scouted.room, found, scouted.field.points[-1], position)
-        return updated._replace(field=updated.field._replace(target=scouted.field.target))
-
-    def _update(self, room: Room, found: np.ndarray, goal: np.ndarray, position: np.ndarray) -> Scouted:
-        """The roadmap without what stands in the way of its edges."""
-        found = found | (room.world.distances(position) < LIDAR_RANGE_M)
-        known, (pairs, length, blocks) = room.world.part(found), room.pairs
-        points = np.concatenate([room.roadmap.points, goal[None]])
-        open_ = np.flatnonzero(~blocks[:, found].any(1))
-        n, seen = len(points), np.flatnonzero(self.shortcut.sees(known, goal, points[:-1]))
-        first, second = np.concatenate([pairs[open_], np.stack([seen, np.full_like(seen, n - 1)], 1)]).T
-        weight = np.concatenate([length[open_], np.linalg.norm(points[seen] - goal, axis=-1)])
-        graph = csr_array((weight, (first, second)), shape=(n, n))
-        to_go = dijkstra(graph, directed=False, indices=n - 1)
-        return Scouted(room, found, Field(known, points, to_go, goal))
-
-
-AnyGuide = WayGuide | ShortcutGuide | ScoutGuide | ExplorerGuide
+AnyGuide = WayGuide | ShortcutGuide | ExplorerGuide
 _GUIDES: dict[str, Callable[[PrmConfig], AnyGuide]] = {
     "roadmap": lambda prm: WayGuide(),
     "shortcut": lambda prm: ShortcutGuide(prm.margin_m, prm.connect_m),
-    "scout": lambda prm: ScoutGuide(ShortcutGuide(prm.margin_m, prm.connect_m)),
     "explorer": lambda prm: ExplorerGuide(RADIUS_M + _CLEAR_M, prm.margin_m),
 }
 

@@ -41,36 +41,20 @@ class World:
         """Signed distance [m] from points [m] to the nearest wall or obstacle: exact outside them, below 0 inside."""
         points = np.asarray(points, np.float64)
         nearest = np.minimum(points, self.side_m - points).min(-1)
-        return np.minimum(nearest, self.distances(points).min(-1, initial=np.inf))
-
-    def distances(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n O"]:
-        """Signed distances [m] from points [m] to each obstacle, boxes first: exact outside them, below 0 inside."""
-        points = np.asarray(points, np.float64)
-        beyond = np.abs(self._in_boxes(points)) - self.boxes[:, 2:4]
+        local, half = self._in_boxes(points), self.boxes[:, 2:4]
+        beyond = np.abs(local) - half
         to_box = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
         to_cylinder = np.linalg.norm(points[..., None, :] - self.cylinders[:, :2], axis=-1) - self.cylinders[:, 2]
-        return np.concatenate([to_box, to_cylinder], -1)
+        return np.minimum(nearest, np.concatenate([to_box, to_cylinder], -1).min(-1, initial=np.inf))
 
     def segment_clearance(self, a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """Distance [m] from the segments a-b to the nearest wall or obstacle, exact; not above 0 where they touch."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         nearest = np.minimum(np.minimum(a, b), self.side_m - np.maximum(a, b)).min(-1)
-        return np.minimum(nearest, self.segment_distances(a, b).min(-1, initial=np.inf))
-
-    def segment_distances(
-        self, a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*n 2"]
-    ) -> Float[np.ndarray, "*n O"]:
-        """Distances [m] from the segments a-b to each obstacle, boxes first; not above 0 where they touch."""
-        a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         to_box = _segment_to_box(self._in_boxes(a), self._in_boxes(b), self.boxes[:, 2:4])
         centre, radius = self.cylinders[:, :2], self.cylinders[:, 2]
         to_cylinder = _segment_to_point(a[..., None, :] - centre, b[..., None, :] - centre) - radius
-        return np.concatenate([to_box, to_cylinder], -1)
-
-    def part(self, kept: Bool[np.ndarray, "O"]) -> "World":
-        """The same room with some of its obstacles, boxes first, alone."""
-        n = len(self.boxes)
-        return World(self.side_m, self.boxes[kept[:n]], self.cylinders[kept[n:]])
+        return np.minimum(nearest, np.concatenate([to_box, to_cylinder], -1).min(-1, initial=np.inf))
 
     def segment_free(self, ends: Float[np.ndarray, "*n 2 2"], radius: float | np.ndarray) -> Bool[np.ndarray, "*n"]:
         """Whether discs of ``radius`` [m] swept from one end to the other [m] touch nothing."""
