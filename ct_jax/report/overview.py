@@ -182,16 +182,19 @@ def _paths(run: Run) -> list[Block]:
 
 
 def _curves(run: Run) -> list[Block]:
-    curves = list(curves_of(run))
-    curves = [c for c in curves if c[1] != "reward"][:3] or curves[:3]
+    """The last training of each network."""
+    several = list(curves_of(run))
+    several = [c for c in several if c[1] != "reward"] or several
+    curves = list({curve[0].partition("-")[0]: curve for curve in several}.values())[:3]
     if not curves:
         return []
 
     def draw(sheet: Sheet, top: float) -> None:
         for i, (stage, what, curve, how) in enumerate(curves):
             left = MARGIN + i * (_THIRD + 0.42)
-            sheet.text(left, top, _short(words.stage_label(stage), 26), fontsize=8, fontweight="bold")
-            sheet.text(left, top + 0.16, what, fontsize=7.5, color=LIGHT["muted"])
+            name, _, again = words.stage_label(stage).partition(", ")
+            sheet.text(left, top, _short(name, 26), fontsize=8, fontweight="bold")
+            sheet.text(left, top + 0.16, f"{what}, {again}" if again else what, fontsize=7.5, color=LIGHT["muted"])
             ax = sheet.axes(left + 0.3, top + 0.42, _THIRD - 0.3, 1.2)
             pictures.draw_curve(ax, curve.step, curve.value, **how)
             ax.tick_params(labelsize=7)
