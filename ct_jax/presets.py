@@ -199,8 +199,8 @@ TURTLEBOT3_CPU = replace(
     reprompt=True,
 )
 """What lifts it: a teacher that knows no more than its pupil, and passes obstacles with room to spare; five seconds of
-memory instead of one; free starts, disturbances, mirrored rooms, relabelled recoveries in six rounds; and
-with its rate raised and then lowered, training takes half the updates."""
+memory instead of one; free starts, disturbances, mirrored rooms, relabelled recoveries in six rounds; and with its rate
+raised and then lowered, training takes half the updates."""
 
 TURTLEBOT3_DEMO = replace(
     TURTLEBOT3_CPU,
