@@ -337,7 +337,10 @@ def _command() -> str:
 
 
 def _commit() -> str:
-    """The commit of this code, if it is the code of a repository and not only installed inside one."""
+    """The commit of this code, if it is the code of a repository and not only installed inside one.
+
+    "-dirty" if tracked files are changed, but for those in which experiments write down what they found.
+    """
     git, here = shutil.which("git"), Path(__file__)
 
     def ask(*arguments: str) -> str | None:
@@ -345,7 +348,11 @@ def _commit() -> str:
         return asked.stdout.strip() if asked.returncode == 0 else None
 
     tracked = git is not None and ask("ls-files", "--error-unmatch", here.name) is not None
-    return (ask("describe", "--always", "--dirty") if tracked else None) or "unknown"
+    if not tracked or not (commit := ask("describe", "--always")):
+        return "unknown"
+    found = (f":(top,exclude){folder}" for folder in ("experiments/results", "docs"))
+    changed = ask("status", "--porcelain", "--untracked-files=no", "--", ":(top)", *found)
+    return f"{commit}-dirty" if changed else commit
 
 
 def hardware() -> str:

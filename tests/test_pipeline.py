@@ -304,3 +304,29 @@ def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, mon
     run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
     assert pipeline.train(run).is_file()
     assert [row["method"] for row in pipeline.results(run.folder)] == ["ct"]
+
+
+def test_only_a_change_of_what_is_no_result_makes_a_commit_dirty(tmp_path, monkeypatch):
+    def git(*arguments):
+        who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        return subprocess.run(
+            ["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout
+
+    code, found = tmp_path / "ct_jax" / "run.py", tmp_path / "experiments" / "results" / "x.json"
+    git("init", "-q")
+    for file in (code, found):
+        file.parent.mkdir(parents=True)
+        file.write_text("1")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = git("describe", "--always").strip()
+    monkeypatch.setattr(runs, "__file__", str(code))
+    assert runs._commit() == commit
+    found.write_text("2")
+    (tmp_path / "new").write_text("not tracked")
+    assert runs._commit() == commit
+    code.write_text("2")
+    assert runs._commit() == f"{commit}-dirty"
+    monkeypatch.setattr(runs, "__file__", str(tmp_path / "new"))
+    assert runs._commit() == "unknown"
