@@ -9,45 +9,45 @@ tokens again, which is how Hugging Face's Decision Transformer acts (torch; same
 
 Last results:
 
-2026-11-24, commit d6b286a, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
 | what                 | median (min-max)    | unit | against              | its    | times (min-max)      | asked |
 |----------------------|---------------------|------|----------------------|--------|----------------------|-------|
-| cpu model, 1         | 0.166 (0.127-0.44)  | ms   | recomputing the      | 0.745  | 4.41 (1.69-5.83)     |       |
+| cpu model, 1         | 0.372 (0.16-0.461)  | ms   | recomputing the      | 0.732  | 1.97 (1.69-6.46)     |       |
 | environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 1         | 0.166 (0.127-0.44)  | ms   | Hugging Face, torch  | 3.96   | 22.30 (12.04-27.43)  |       |
+| cpu model, 1         | 0.372 (0.16-0.461)  | ms   | Hugging Face, torch  | 2.64   | 10.85 (5.92-30.26)   |       |
 | environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 1         | 0.238 (0.223-0.528) | ms   | recomputing the      | 6      | 25.21 (9.47-28.91)   |       |
+| cpu model, 1         | 0.217 (0.199-0.507) | ms   | recomputing the      | 4.79   | 22.91 (9.09-31.80)   |       |
 | environments, K=50   |                     |      | window               |        |                      |       |
-| cpu model, 1         | 0.238 (0.223-0.528) | ms   | Hugging Face, torch  | 7.01   | 28.57 (11.98-30.62)  |       |
+| cpu model, 1         | 0.217 (0.199-0.507) | ms   | Hugging Face, torch  | 4.57   | 21.72 (8.17-43.08)   |       |
 | environments, K=50   |                     |      |                      |        |                      |       |
-| cpu model, 1         | 0.297 (0.264-0.591) | ms   | recomputing the      | 31.3   | 106.27               |       |
-| environments, K=200  |                     |      | window               |        | (50.30-113.97)       |       |
-| cpu model, 1         | 0.297 (0.264-0.591) | ms   | Hugging Face, torch  | 13.1   | 44.88 (21.64-49.66)  |       |
+| cpu model, 1         | 0.385 (0.365-0.647) | ms   | recomputing the      | 42.7   | 111.22               |       |
+| environments, K=200  |                     |      | window               |        | (68.74-117.08)       |       |
+| cpu model, 1         | 0.385 (0.365-0.647) | ms   | Hugging Face, torch  | 11.5   | 30.42 (18.04-33.43)  |       |
 | environments, K=200  |                     |      |                      |        |                      |       |
-| cpu model, 100       | 5.71 (4.7-6.03)     | ms   | recomputing the      | 21     | 3.68 (3.03-4.20)     |       |
+| cpu model, 100       | 4.24 (4.13-4.35)    | ms   | recomputing the      | 14.8   | 3.48 (3.40-4.29)     |       |
 | environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 100       | 5.71 (4.7-6.03)     | ms   | Hugging Face, torch  | 27.6   | 4.72 (4.58-7.91)     |       |
+| cpu model, 100       | 4.24 (4.13-4.35)    | ms   | Hugging Face, torch  | 17.5   | 4.21 (3.96-6.30)     |       |
 | environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 100       | 9.07 (8.34-9.97)    | ms   | recomputing the      | 276    | 32.21 (29.20-46.15)  |       |
+| cpu model, 100       | 8.69 (8.2-9.05)     | ms   | recomputing the      | 314    | 37.10 (35.04-37.46)  |       |
 | environments, K=50   |                     |      | window               |        |                      |       |
-| cpu model, 100       | 9.07 (8.34-9.97)    | ms   | Hugging Face, torch  | 272    | 29.95 (26.95-36.80)  |       |
+| cpu model, 100       | 8.69 (8.2-9.05)     | ms   | Hugging Face, torch  | 178    | 20.35 (18.38-27.67)  |       |
 | environments, K=50   |                     |      |                      |        |                      |       |
-| cpu model, 100       | 27.4 (25.5-29.3)    | ms   | recomputing the      | 4,597  | 168.74               |       |
-| environments, K=200  |                     |      | window               |        | (155.70-181.79)      |       |
-| cpu model, 100       | 27.4 (25.5-29.3)    | ms   | Hugging Face, torch  | 1,733  | 63.41 (61.50-65.33)  |       |
+| cpu model, 100       | 29.5 (28.8-30.2)    | ms   | recomputing the      | 5,223  | 177.19               |       |
+| environments, K=200  |                     |      | window               |        | (174.10-180.28)      |       |
+| cpu model, 100       | 29.5 (28.8-30.2)    | ms   | Hugging Face, torch  | 1,191  | 40.31 (36.97-43.66)  |       |
 | environments, K=200  |                     |      |                      |        |                      |       |
-| cpu model, 4096      | 151 (140-163)       | ms   | recomputing the      | 812    | 5.40 (5.11-5.68)     |       |
+| cpu model, 4096      | 157 (148-158)       | ms   | recomputing the      | 705    | 4.50 (4.47-4.76)     |       |
 | environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 4096      | 151 (140-163)       | ms   | Hugging Face, torch  | 1,177  | 7.86 (6.95-8.77)     |       |
+| cpu model, 4096      | 157 (148-158)       | ms   | Hugging Face, torch  | 892    | 5.63 (5.20-6.16)     |       |
 | environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 4096      | 337 (331-342)       | ms   |                      |        |                      |       |
+| cpu model, 4096      | 369 (362-378)       | ms   |                      |        |                      |       |
 | environments, K=50   |                     |      |                      |        |                      |       |
-| paper model, 100     | 115 (115-116)       | ms   | Hugging Face, torch  | 15,861 | 137.48               | 100   |
-| environments, K=200  |                     |      |                      |        | (133.84-141.12)      |       |
+| paper model, 100     | 117 (115-119)       | ms   | Hugging Face, torch  | 11,226 | 96.08 (92.22-99.95)  | 100   |
+| environments, K=200  |                     |      |                      |        |                      |       |
 """
 
 import functools

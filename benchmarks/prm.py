@@ -5,37 +5,37 @@
 Against two peers on the same maze. *Python loop* is the same roadmap as one would write it down with networkx: a loop
 over pairs of points, over the wall cells near each, and over the goals of the table. *OMPL* is its PRM with the
 number of samples and of neighbours that ours has on average, states checked by a Python function, as PyPI's package
-has it; it samples its edges every 0.1 m, where ours are exact, and has no table.
+has it; it samples its edges every 0.1 m, where ours are exact, and has no table. Roadmaps are built several
+in a row, as a collection builds them.
 
 Last results:
 
-2026-11-25, commit b53458e, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
-| what                         | median (min-max)    | unit | against        | its   | times (min-max)     | asked |
-|------------------------------|---------------------|------|----------------|-------|---------------------|-------|
-| 100 samples: build           | 1.78 (1.51-1.95)    | ms   | OMPL           | 6.83  | 4.23 (3.30-4.68)    |       |
-| 100 samples: build           | 1.76 (1.62-1.82)    | ms   | Python loop    | 4.57  | 2.63 (2.56-4.20)    |       |
-| 100 samples: build and table | 3.38 (3.18-3.52)    | ms   | Python loop    | 29.4  | 8.63 (8.45-9.45)    |       |
-| 100 samples: a plan          | 1.5 (1.47-1.56)     | ms   | Python loop    | 0.359 | 0.24 (0.24-0.25)    |       |
-| 100 samples: a plan          | 1.5 (1.47-1.56)     | ms   | OMPL           | 1.35  | 0.90 (0.53-1.51)    |       |
-| 200 samples: build           | 2.28 (2.07-2.39)    | ms   | OMPL           | 26.4  | 11.53 (11.06-12.82) |       |
-| 200 samples: build           | 2.03 (1.87-2.12)    | ms   | Python loop    | 16.7  | 8.35 (8.00-8.89)    |       |
-| 200 samples: build and table | 9.72 (8.59-10)      | ms   | Python loop    | 168   | 17.48 (16.75-19.53) |       |
-| 200 samples: a plan          | 1.8 (1.7-2.04)      | ms   | Python loop    | 0.756 | 0.43 (0.38-0.45)    |       |
-| 200 samples: a plan          | 1.8 (1.7-2.04)      | ms   | OMPL           | 12.4  | 6.87 (4.08-15.55)   |       |
-| 1000 samples: build          | 9.97 (8.41-11.3)    | ms   | OMPL           | 485   | 49.37 (43.05-57.44) | 2     |
-| 1000 samples: build          | 9.48 (9.15-10.5)    | ms   | Python loop    | 434   | 45.61 (41.09-50.87) | 50    |
-| 1000 samples: build and      | 386 (370-393)       | ms   |                |       |                     |       |
-| table                        |                     |      |                |       |                     |       |
-| 1000 samples: a plan         | 7.08 (7.07-7.15)    | ms   | Python loop    | 12.5  | 1.76 (1.72-1.77)    |       |
-| 1000 samples: a plan         | 7.08 (7.07-7.15)    | ms   | OMPL           | 118   | 16.53 (15.59-26.40) |       |
-| 5000 samples: build          | 203 (189-212)       | ms   |                |       |                     |       |
-| 5000 samples: a plan         | 172 (171-173)       | ms   | Python loop    | 636   | 3.69 (3.66-3.73)    |       |
-| growth: an edge at 5000      | 0.162 (0.155-0.162) | µs   | an edge at 200 | 1.3   | 8.03 (7.32-11.54)   | 0.769 |
-| samples                      |                     |      |                |       |                     |       |
+| what                           | median (min-max)  | unit | against        | its   | times (min-max)     | asked |
+|--------------------------------|-------------------|------|----------------|-------|---------------------|-------|
+| 100 samples: build             | 1.9 (1.78-2.04)   | ms   | OMPL           | 7.25  | 3.86 (3.03-4.32)    |       |
+| 100 samples: build             | 1.76 (1.7-1.89)   | ms   | Python loop    | 5.11  | 2.90 (2.56-3.06)    |       |
+| 100 samples: build and table   | 4.11 (3.65-4.6)   | ms   | Python loop    | 32.5  | 7.87 (7.09-9.02)    |       |
+| 100 samples: a plan            | 1.6 (1.52-1.7)    | ms   | Python loop    | 0.415 | 0.26 (0.24-0.26)    |       |
+| 100 samples: a plan            | 1.6 (1.52-1.7)    | ms   | OMPL           | 1.57  | 1.00 (0.76-1.89)    |       |
+| 200 samples: build             | 2.97 (2.75-3.5)   | ms   | OMPL           | 32.2  | 10.90 (8.92-11.72)  |       |
+| 200 samples: build             | 3.01 (2.48-4.07)  | ms   | Python loop    | 19.6  | 6.50 (4.70-8.65)    |       |
+| 200 samples: build and table   | 10.9 (9.85-12.1)  | ms   | Python loop    | 189   | 16.68 (15.91-19.64) |       |
+| 200 samples: a plan            | 1.83 (1.75-2.01)  | ms   | Python loop    | 0.791 | 0.44 (0.43-0.44)    |       |
+| 200 samples: a plan            | 1.83 (1.75-2.01)  | ms   | OMPL           | 11.3  | 6.36 (4.75-11.78)   |       |
+| 1000 samples: build            | 12.2 (10.6-13)    | ms   | OMPL           | 510   | 41.36 (39.40-46.31) | 2     |
+| 1000 samples: build            | 11.4 (10.5-12.3)  | ms   | Python loop    | 468   | 41.49 (38.09-45.62) | 50    |
+| 1000 samples: build and table  | 412 (387-453)     | ms   |                |       |                     |       |
+| 1000 samples: a plan           | 7.36 (7.36-7.89)  | ms   | Python loop    | 14    | 1.91 (1.87-1.99)    |       |
+| 1000 samples: a plan           | 7.36 (7.36-7.89)  | ms   | OMPL           | 177   | 22.43 (12.50-28.11) |       |
+| 5000 samples: build            | 222 (199-489)     | ms   |                |       |                     |       |
+| 5000 samples: a plan           | 187 (185-189)     | ms   | Python loop    | 731   | 3.91 (3.80-4.02)    |       |
+| growth: an edge at 5000        | 0.165 (0.164-0.2) | µs   | an edge at 200 | 1.62  | 9.32 (7.89-12.40)   | 0.769 |
+| samples                        |                   |      |                |       |                     |       |
 """
 
 import math
@@ -92,6 +92,11 @@ def building(maze: Maze, samples: int) -> Callable[[], Roadmap]:
     return lambda: build_roadmap(jax.random.key(next(seeds)), maze, radius_m=RADIUS_M, config=config)
 
 
+def _times(n: int, build: Callable[[], object]) -> Callable[[], list[object]]:
+    """A function that builds n times."""
+    return lambda: [build() for _ in range(n)]
+
+
 def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: Results) -> None:
     """The rows of one size."""
     build = building(maze, samples)
@@ -99,15 +104,17 @@ def measure(maze: Maze, samples: int, ompl: bool, options: PrmOptions, results: 
     walls, points = np.asarray(maze.walls).tolist(), roadmap.points.tolist()
     cell, reach = float(maze.cell_m), roadmap.config.connect_m
     looped = options.full or samples <= options.loop_up_to
-    loop = {LOOP: Contestant(lambda: loop_roadmap(points, walls, cell, reach), compiles=False)} if looped else {}
+    ours, theirs = max(1, 10_000 // samples), max(1, 2000 // samples)  # in a row
+    looping = Contestant(_times(theirs, lambda: loop_roadmap(points, walls, cell, reach)), theirs, compiles=False)
+    loop = {LOOP: looping} if looped else {}
     planner = OmplPlanner(maze, max(1, round(2 * len(roadmap.edges) / samples))) if ompl else None
-    fast = {OMPL: Contestant(lambda: planner.build(samples), compiles=False)} if planner else {}
+    fast = {OMPL: Contestant(_times(theirs, lambda: planner.build(samples)), theirs, compiles=False)} if planner else {}
     asked = {OMPL: 2.0} if samples == 1000 else {}
-    results.race(f"{samples} samples: build", "ms", Contestant(lambda: build().edges), fast, asked=asked)
+    one = Contestant(_times(ours, lambda: build().edges), ours)
+    results.race(f"{samples} samples: build", "ms", one, fast, asked=asked)
     if loop:
         asked = {LOOP: 50.0} if samples == 1000 else {}
-        build_too = Contestant(lambda: build().edges)
-        results.race(f"{samples} samples: build", "ms", build_too, loop, asked=asked)
+        results.race(f"{samples} samples: build", "ms", one, loop, asked=asked)
     if options.full or samples <= options.table_up_to:
         tabled = samples <= (1000 if options.full else options.loop_table_up_to)
         graph = roadmap.graph

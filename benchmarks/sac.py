@@ -12,23 +12,31 @@ the peer, too, learns until it walks 90 % of the edges.
 
 Last results:
 
-2026-11-24, commit d6b286a, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
-| what                        | median (min-max) | unit      | against           | its  | times (min-max)  | asked |
-|-----------------------------|------------------|-----------|-------------------|------|------------------|-------|
-| point, 1 environments, 1    | 210 (194-236)    | updates/s | Stable-Baselines3 | 83.8 | 2.60 (2.31-3.02) | 2.5   |
-| updates a step              |                  |           |                   |      |                  |       |
-| point, 64 environments, 8   | 202 (184-220)    | updates/s | Stable-Baselines3 | 89.4 | 2.12 (1.85-2.70) | 5     |
-| updates a step              |                  |           |                   |      |                  |       |
-| ant, 1 environments, 1      | 173 (151-188)    | updates/s | Stable-Baselines3 | 77.5 | 2.22 (2.04-2.53) | 2.5   |
-| updates a step              |                  |           |                   |      |                  |       |
-| ant, 64 environments, 8     | 179 (172-181)    | updates/s | Stable-Baselines3 | 96.7 | 1.85 (1.78-1.94) | 5     |
-| updates a step              |                  |           |                   |      |                  |       |
-| point: until 90 % of the    | 1.62 (1.62-1.62) | s         |                   |      |                  |       |
-| edges are walked            |                  |           |                   |      |                  |       |
+| what                     | median (min-max)    | unit      | against           | its  | times (min-max)  | asked |
+|--------------------------|---------------------|-----------|-------------------|------|------------------|-------|
+| point, 1 environments, 1 | 231 (219-243)       | updates/s | products alone    | 464  | 0.50 (0.49-0.51) |       |
+| updates a step           |                     |           |                   |      |                  |       |
+| point, 1 environments, 1 | 231 (219-243)       | updates/s | Stable-Baselines3 | 92.1 | 2.51 (2.44-2.57) | 2.5   |
+| updates a step           |                     |           |                   |      |                  |       |
+| point, 64 environments,  | 262 (249-274)       | updates/s | products alone    | 475  | 0.55 (0.53-0.57) |       |
+| 8 updates a step         |                     |           |                   |      |                  |       |
+| point, 64 environments,  | 262 (249-274)       | updates/s | Stable-Baselines3 | 97.1 | 2.72 (2.37-3.07) | 5     |
+| 8 updates a step         |                     |           |                   |      |                  |       |
+| ant, 1 environments, 1   | 191 (182-199)       | updates/s | products alone    | 388  | 0.49 (0.47-0.51) |       |
+| updates a step           |                     |           |                   |      |                  |       |
+| ant, 1 environments, 1   | 191 (182-199)       | updates/s | Stable-Baselines3 | 72.6 | 2.62 (2.62-2.63) | 2.5   |
+| updates a step           |                     |           |                   |      |                  |       |
+| ant, 64 environments, 8  | 207 (205-210)       | updates/s | products alone    | 428  | 0.49 (0.47-0.50) |       |
+| updates a step           |                     |           |                   |      |                  |       |
+| ant, 64 environments, 8  | 207 (205-210)       | updates/s | Stable-Baselines3 | 107  | 1.95 (1.84-2.06) | 5     |
+| updates a step           |                     |           |                   |      |                  |       |
+| point: until 90 % of the | 0.916 (0.916-0.916) | s         |                   |      |                  |       |
+| edges are walked         |                     |           |                   |      |                  |       |
 """
 
 import time
