@@ -10,32 +10,33 @@ in a row, as a collection builds them.
 
 Last results:
 
-2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit 5db53ae, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
-| what                           | median (min-max)  | unit | against        | its   | times (min-max)     | asked |
-|--------------------------------|-------------------|------|----------------|-------|---------------------|-------|
-| 100 samples: build             | 1.9 (1.78-2.04)   | ms   | OMPL           | 7.25  | 3.86 (3.03-4.32)    |       |
-| 100 samples: build             | 1.76 (1.7-1.89)   | ms   | Python loop    | 5.11  | 2.90 (2.56-3.06)    |       |
-| 100 samples: build and table   | 4.11 (3.65-4.6)   | ms   | Python loop    | 32.5  | 7.87 (7.09-9.02)    |       |
-| 100 samples: a plan            | 1.6 (1.52-1.7)    | ms   | Python loop    | 0.415 | 0.26 (0.24-0.26)    |       |
-| 100 samples: a plan            | 1.6 (1.52-1.7)    | ms   | OMPL           | 1.57  | 1.00 (0.76-1.89)    |       |
-| 200 samples: build             | 2.97 (2.75-3.5)   | ms   | OMPL           | 32.2  | 10.90 (8.92-11.72)  |       |
-| 200 samples: build             | 3.01 (2.48-4.07)  | ms   | Python loop    | 19.6  | 6.50 (4.70-8.65)    |       |
-| 200 samples: build and table   | 10.9 (9.85-12.1)  | ms   | Python loop    | 189   | 16.68 (15.91-19.64) |       |
-| 200 samples: a plan            | 1.83 (1.75-2.01)  | ms   | Python loop    | 0.791 | 0.44 (0.43-0.44)    |       |
-| 200 samples: a plan            | 1.83 (1.75-2.01)  | ms   | OMPL           | 11.3  | 6.36 (4.75-11.78)   |       |
-| 1000 samples: build            | 12.2 (10.6-13)    | ms   | OMPL           | 510   | 41.36 (39.40-46.31) | 2     |
-| 1000 samples: build            | 11.4 (10.5-12.3)  | ms   | Python loop    | 468   | 41.49 (38.09-45.62) | 50    |
-| 1000 samples: build and table  | 412 (387-453)     | ms   |                |       |                     |       |
-| 1000 samples: a plan           | 7.36 (7.36-7.89)  | ms   | Python loop    | 14    | 1.91 (1.87-1.99)    |       |
-| 1000 samples: a plan           | 7.36 (7.36-7.89)  | ms   | OMPL           | 177   | 22.43 (12.50-28.11) |       |
-| 5000 samples: build            | 222 (199-489)     | ms   |                |       |                     |       |
-| 5000 samples: a plan           | 187 (185-189)     | ms   | Python loop    | 731   | 3.91 (3.80-4.02)    |       |
-| growth: an edge at 5000        | 0.165 (0.164-0.2) | µs   | an edge at 200 | 1.62  | 9.32 (7.89-12.40)   | 0.769 |
-| samples                        |                   |      |                |       |                     |       |
+| what                         | median (min-max)    | unit | against        | its   | times (min-max)     | asked |
+|------------------------------|---------------------|------|----------------|-------|---------------------|-------|
+| 100 samples: build           | 1.82 (1.74-1.84)    | ms   | OMPL           | 7.6   | 4.29 (4.02-4.47)    |       |
+| 100 samples: build           | 1.79 (1.73-2.02)    | ms   | Python loop    | 5.58  | 3.09 (2.85-7.80)    |       |
+| 100 samples: build and table | 4.69 (4.32-5.22)    | ms   | Python loop    | 32.4  | 7.01 (6.23-7.53)    |       |
+| 100 samples: a plan          | 1.91 (1.81-2.08)    | ms   | Python loop    | 0.465 | 0.24 (0.22-0.26)    |       |
+| 100 samples: a plan          | 1.91 (1.81-2.08)    | ms   | OMPL           | 3.32  | 1.72 (1.23-4.10)    |       |
+| 200 samples: build           | 2.25 (1.94-3.72)    | ms   | OMPL           | 29.7  | 13.42 (7.95-14.90)  |       |
+| 200 samples: build           | 2.33 (2.31-2.4)     | ms   | Python loop    | 21.6  | 9.04 (8.92-9.27)    |       |
+| 200 samples: build and table | 13.7 (12-14.9)      | ms   | Python loop    | 208   | 14.92 (14.13-17.63) |       |
+| 200 samples: a plan          | 2.16 (1.9-2.36)     | ms   | Python loop    | 0.907 | 0.42 (0.39-0.48)    |       |
+| 200 samples: a plan          | 2.16 (1.9-2.36)     | ms   | OMPL           | 19.8  | 9.16 (3.27-11.19)   |       |
+| 1000 samples: build          | 11.7 (11.4-17.2)    | ms   | OMPL           | 533   | 45.43 (30.38-47.38) | 2     |
+| 1000 samples: build          | 12 (11.2-23.2)      | ms   | Python loop    | 582   | 48.68 (24.93-52.38) | 50    |
+| 1000 samples: build and      | 440 (431-446)       | ms   |                |       |                     |       |
+| table                        |                     |      |                |       |                     |       |
+| 1000 samples: a plan         | 9.06 (8.08-9.28)    | ms   | Python loop    | 15.5  | 1.77 (1.63-1.87)    |       |
+| 1000 samples: a plan         | 9.06 (8.08-9.28)    | ms   | OMPL           | 97.5  | 11.45 (7.35-14.04)  |       |
+| 5000 samples: build          | 224 (211-434)       | ms   |                |       |                     |       |
+| 5000 samples: a plan         | 204 (200-207)       | ms   | Python loop    | 822   | 4.04 (3.85-4.23)    |       |
+| growth: an edge at 5000      | 0.146 (0.145-0.162) | µs   | an edge at 200 | 1.7   | 11.58 (10.50-12.43) | 0.769 |
+| samples                      |                     |      |                |       |                     |       |
 """
 
 import math
