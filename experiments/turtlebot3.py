@@ -11,7 +11,7 @@ Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other se
 ``docs/turtlebot3-density.png`` and ``-noise.png``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,15 +89,16 @@ def run_all(options: Options) -> Path:
     for name, kinds in swept.items() if options.sweeps else ():
         folder = options.out / f"{name}-{options.seeds[0]}"
         run = Run(folder, "turtlebot3", options.preset, variants[name], {}, {}, options.seeds[0], "auto")
-        found = _sweep(folder, load_model(str(folder)), variants[name], kinds, references=name == next(iter(swept)))
-        write_results(file, {kind: [label(run, name, row) for row in rows] for kind, rows in found.items()})
+        model, references = load_model(str(folder)), name == next(iter(swept))
+        for kind, row in _sweep(folder, model, variants[name], kinds, references=references):
+            write_results(file, {kind: [label(run, name, row)]})
     return file
 
 
 def _sweep(
     folder: Path, model: Any, settings: Any, kinds: tuple[str, ...], *, references: bool
-) -> dict[str, list[dict[str, Any]]]:
-    """Those kinds of: other densities, levels of noise, and the seven pairs."""
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of those kinds: other densities, levels of noise, and the seven pairs."""
     from ct_jax.evaluate import GUIDED
     from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 
@@ -109,15 +110,11 @@ def _sweep(
         "noise": (LEVELS, lambda method, at: evaluate_in_rooms(model, method, seed, noise=at, **where)),
         "seven": (SEVEN_LEVELS, lambda method, at: evaluate_seven_pairs(model, method, noise=at)),
     }
-    return {
-        kind: [
-            _kept(kept / f"{kind}-{at}-{method}.json", lambda m=method, a=at, f=measure: f(m, a))
-            for method in ("ct", *(GUIDED if references else ()))
-            for at in points
-        ]
-        for kind, (points, measure) in measures.items()
-        if kind in kinds
-    }
+    for method in ("ct", *(GUIDED if references else ())):
+        for kind in kinds:
+            points, measure = measures[kind]
+            for at in points:
+                yield kind, _kept(kept / f"{kind}-{at}-{method}.json", lambda m=method, a=at, f=measure: f(m, a))
 
 
 def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
