@@ -55,7 +55,7 @@ format: setup ## Format the code and mend what the linter can mend
 	@$(BIN)/ruff format .
 
 # The commit is asked for once: the benchmarks write their tables into the sources, and that is no change of the code.
-bench: setup ## Run every benchmark (a quarter of an hour on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
+bench: setup ## Run every benchmark (12 minutes on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
 	@export BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; for script in $(filter-out benchmarks/scale.py,$(sort $(wildcard benchmarks/[a-z]*.py))) benchmarks/scale.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
 # pip-tools lives in an environment of its own, so that it can neither be locked nor disturb what is.

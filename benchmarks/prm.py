@@ -10,32 +10,32 @@ in a row, as a collection builds them.
 
 Last results:
 
-2026-11-25, commit 5db53ae, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
+2026-11-25, commit 08323bd, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
 brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
 gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
 
 
 | what                         | median (min-max)    | unit | against        | its   | times (min-max)     | asked |
 |------------------------------|---------------------|------|----------------|-------|---------------------|-------|
-| 100 samples: build           | 1.82 (1.74-1.84)    | ms   | OMPL           | 7.6   | 4.29 (4.02-4.47)    |       |
-| 100 samples: build           | 1.79 (1.73-2.02)    | ms   | Python loop    | 5.58  | 3.09 (2.85-7.80)    |       |
-| 100 samples: build and table | 4.69 (4.32-5.22)    | ms   | Python loop    | 32.4  | 7.01 (6.23-7.53)    |       |
-| 100 samples: a plan          | 1.91 (1.81-2.08)    | ms   | Python loop    | 0.465 | 0.24 (0.22-0.26)    |       |
-| 100 samples: a plan          | 1.91 (1.81-2.08)    | ms   | OMPL           | 3.32  | 1.72 (1.23-4.10)    |       |
-| 200 samples: build           | 2.25 (1.94-3.72)    | ms   | OMPL           | 29.7  | 13.42 (7.95-14.90)  |       |
-| 200 samples: build           | 2.33 (2.31-2.4)     | ms   | Python loop    | 21.6  | 9.04 (8.92-9.27)    |       |
-| 200 samples: build and table | 13.7 (12-14.9)      | ms   | Python loop    | 208   | 14.92 (14.13-17.63) |       |
-| 200 samples: a plan          | 2.16 (1.9-2.36)     | ms   | Python loop    | 0.907 | 0.42 (0.39-0.48)    |       |
-| 200 samples: a plan          | 2.16 (1.9-2.36)     | ms   | OMPL           | 19.8  | 9.16 (3.27-11.19)   |       |
-| 1000 samples: build          | 11.7 (11.4-17.2)    | ms   | OMPL           | 533   | 45.43 (30.38-47.38) | 2     |
-| 1000 samples: build          | 12 (11.2-23.2)      | ms   | Python loop    | 582   | 48.68 (24.93-52.38) | 50    |
-| 1000 samples: build and      | 440 (431-446)       | ms   |                |       |                     |       |
+| 100 samples: build           | 1.54 (1.52-1.71)    | ms   | OMPL           | 6.8   | 4.40 (4.05-4.46)    |       |
+| 100 samples: build           | 1.52 (1.51-1.66)    | ms   | Python loop    | 4.54  | 2.99 (2.72-8.28)    |       |
+| 100 samples: build and table | 3.85 (3.73-3.97)    | ms   | Python loop    | 28.9  | 7.50 (7.29-7.75)    |       |
+| 100 samples: a plan          | 1.48 (1.45-1.64)    | ms   | Python loop    | 0.378 | 0.25 (0.23-0.26)    |       |
+| 100 samples: a plan          | 1.48 (1.45-1.64)    | ms   | OMPL           | 1.54  | 1.02 (0.66-1.76)    |       |
+| 200 samples: build           | 2.01 (1.98-2.96)    | ms   | OMPL           | 27.9  | 13.88 (8.92-14.17)  |       |
+| 200 samples: build           | 2.01 (1.98-2.07)    | ms   | Python loop    | 17.5  | 8.71 (8.59-8.85)    |       |
+| 200 samples: build and table | 10.6 (9.76-11.7)    | ms   | Python loop    | 171   | 15.95 (14.66-17.98) |       |
+| 200 samples: a plan          | 1.82 (1.78-2.02)    | ms   | Python loop    | 0.785 | 0.43 (0.39-0.45)    |       |
+| 200 samples: a plan          | 1.82 (1.78-2.02)    | ms   | OMPL           | 12.1  | 6.06 (3.40-12.64)   |       |
+| 1000 samples: build          | 9.35 (8.6-14.2)     | ms   | OMPL           | 490   | 52.18 (34.88-57.12) | 2     |
+| 1000 samples: build          | 9.93 (9.16-14.3)    | ms   | Python loop    | 458   | 46.15 (32.74-49.71) | 50    |
+| 1000 samples: build and      | 391 (376-399)       | ms   |                |       |                     |       |
 | table                        |                     |      |                |       |                     |       |
-| 1000 samples: a plan         | 9.06 (8.08-9.28)    | ms   | Python loop    | 15.5  | 1.77 (1.63-1.87)    |       |
-| 1000 samples: a plan         | 9.06 (8.08-9.28)    | ms   | OMPL           | 97.5  | 11.45 (7.35-14.04)  |       |
-| 5000 samples: build          | 224 (211-434)       | ms   |                |       |                     |       |
-| 5000 samples: a plan         | 204 (200-207)       | ms   | Python loop    | 822   | 4.04 (3.85-4.23)    |       |
-| growth: an edge at 5000      | 0.146 (0.145-0.162) | µs   | an edge at 200 | 1.7   | 11.58 (10.50-12.43) | 0.769 |
+| 1000 samples: a plan         | 7.45 (7.41-7.47)    | ms   | Python loop    | 14.9  | 2.01 (1.88-2.02)    |       |
+| 1000 samples: a plan         | 7.45 (7.41-7.47)    | ms   | OMPL           | 136   | 18.19 (13.89-20.55) |       |
+| 5000 samples: build          | 233 (203-383)       | ms   |                |       |                     |       |
+| 5000 samples: a plan         | 180 (180-180)       | ms   | Python loop    | 740   | 4.11 (4.08-4.14)    |       |
+| growth: an edge at 5000      | 0.154 (0.144-0.222) | µs   | an edge at 200 | 1.36  | 9.09 (6.13-10.03)   | 0.769 |
 | samples                      |                     |      |                |       |                     |       |
 """
 
