@@ -62,7 +62,7 @@ import tyro
 from _harness import Contestant, Options, Results, about, has_peer
 
 from ct_jax.presets import get_preset
-from ct_jax.transformer import TOKENS, ControlTransformer, ModelConfig, empty_cache, sample_inputs
+from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache, sample_inputs
 
 PROPRIO, ACTION = 27, 8  # the ant's
 RECOMPUTED = "recomputing the window"
@@ -107,7 +107,7 @@ def measure(
     """The rows of one size."""
     config = replace(get_preset(preset).model, context=context, context_acting=context)
     name = f"{preset} model, {n} environments, K={context}"
-    gigabytes = 2 * config.layers * n * TOKENS * (context + 1) * config.width * 4 / 1e9
+    gigabytes = 2 * config.layers * n * config.tokens * (context + 1) * config.width * 4 / 1e9
     if gigabytes > options.memory_gb:
         print(f"{name}: a cache of {gigabytes:.0f} GB; not measured (--memory-gb)")
         return

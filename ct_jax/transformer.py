@@ -21,7 +21,6 @@ from ct_envs.occupancy import MAP_CELLS
 from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
-TOKENS = 3  # of a step: return-to-go, state, action
 GOAL_SCALE_M = 10.0  # goal vectors are divided by this
 RETURN_SCALE = 1000.0  # returns are divided by this
 SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
@@ -40,8 +39,14 @@ class ModelConfig:
     max_timestep: int = 1024  # embeddings of the absolute timestep
     map_cell_m: float = 0.8  # side of a cell of the local map [m]
     returns: bool = True  # condition on returns; without them this is BC-CT
+    actions: bool = True  # see its own past actions, as the paper's does; without them, it cannot repeat itself
     frame: str = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
     directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
+
+    @property
+    def tokens(self) -> int:
+        """Of a step: return-to-go, state and, where it is seen, action."""
+        return 3 if self.actions else 2
 
 
 _NEVER = -(10**6)  # the step of a token that is not there
@@ -49,7 +54,7 @@ _NEVER = -(10**6)  # the step of a token that is not there
 
 @struct.dataclass
 class Cache:
-    """Keys and values of the last steps of N episodes, a ring of K + 1 places for the tokens a_{t-1}, R_t, s_t.
+    """Keys and values of the last steps of N episodes, a ring of K + 1 places for the tokens (a_{t-1},) R_t, s_t.
 
     One place more than K: the last action still sees K steps back from its own. The places come last, as XLA's matrix
     products on CPU want them: otherwise each step would transpose the whole cache.
@@ -172,7 +177,8 @@ class ControlTransformer(nn.Module):
         self.encode_map = MapEncoder(c.width, dtype=self.dtype)
         self.embed_goal = dense(c.width)
         self.embed_state = dense(c.width)
-        self.embed_action = dense(c.width)
+        if c.actions:
+            self.embed_action = dense(c.width)
         self.embed_return = dense(c.width)
         self.embed_timestep = nn.Embed(
             c.max_timestep, c.width, embedding_init=nn.initializers.normal(0.02), dtype=self.dtype
@@ -219,19 +225,19 @@ class ControlTransformer(nn.Module):
         deterministic: bool = True,
     ) -> Float[Array, "B S A"]:
         """Predicted actions of all steps of pieces of S steps. Steps that are not ``valid`` must come last."""
-        batch, steps = rtg.shape
-        state = self._embed_state(maps, proprio, goal)
-        tokens = jnp.stack([self._embed_return(rtg), state, self.embed_action(action)], 2)
-        x = (tokens + self._embed_time(timestep)[:, :, None]).reshape(batch, TOKENS * steps, -1)
+        (batch, steps), n = rtg.shape, self.config.tokens
+        tokens = [self._embed_return(rtg), self._embed_state(maps, proprio, goal)]
+        tokens += [self.embed_action(action)] if self.config.actions else []
+        x = (jnp.stack(tokens, 2) + self._embed_time(timestep)[:, :, None]).reshape(batch, n * steps, -1)
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
-        step = jnp.arange(TOKENS * steps) // TOKENS
-        mask = band(step, step, context or self.config.context) & jnp.tri(TOKENS * steps, dtype=bool)
-        mask = mask[None] & (jnp.repeat(valid, TOKENS, 1) > 0)[:, None, :] | jnp.eye(TOKENS * steps, dtype=bool)[None]
+        step = jnp.arange(n * steps) // n
+        mask = band(step, step, context or self.config.context) & jnp.tri(n * steps, dtype=bool)
+        mask = mask[None] & (jnp.repeat(valid, n, 1) > 0)[:, None, :] | jnp.eye(n * steps, dtype=bool)[None]
         for block in self.blocks[:-1]:
             x = block.attend(x, *block.heads(x), mask, deterministic)
         # Of the last block only the state tokens are asked for anything.
         q, k, v = self.blocks[-1].heads(x)
-        states = slice(1, None, TOKENS)
+        states = slice(1, None, n)
         x = self.blocks[-1].attend(x[:, states], q[:, states], k, v, mask[:, states], deterministic)
         return self._predict(x, proprio)
 
@@ -244,16 +250,17 @@ class ControlTransformer(nn.Module):
         rtg: Float[Array, "N"],
     ) -> tuple[Float[Array, "N A"], Cache]:
         """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
-        t = cache.now
-        before = self.embed_action(cache.action) + self._embed_time(t - 1)[None]
+        t, n = cache.now, self.config.tokens
         now = self._embed_time(t)[None]
-        x = jnp.stack([before, self._embed_return(rtg) + now, self._embed_state(maps, proprio, goal) + now], 1)
-        x = self.norm_in(x)
-        # The first step has no action before it: its token is said to be of a step that no query reaches.
-        step_of = jnp.array([jnp.where(t > 0, t - 1, _NEVER), t, t])
-        place = t % (cache.step.shape[0] // TOKENS) * TOKENS
+        tokens, steps = [self._embed_return(rtg) + now, self._embed_state(maps, proprio, goal) + now], [t, t]
+        if self.config.actions:
+            tokens.insert(0, self.embed_action(cache.action) + self._embed_time(t - 1)[None])
+            # The first step has no action before it: its token is said to be of a step that no query reaches.
+            steps.insert(0, jnp.where(t > 0, t - 1, _NEVER))
+        x, step_of = self.norm_in(jnp.stack(tokens, 1)), jnp.stack(steps)
+        place = t % (cache.step.shape[0] // n) * n
         step = jax.lax.dynamic_update_slice(cache.step, step_of, (place,))
-        order = jnp.arange(TOKENS)
+        order = jnp.arange(n)
         later = jnp.zeros_like(step).at[place + order].set(order)  # of the new tokens, none sees a later one
         mask = band(step_of, step, self.config.context_acting) & (later[None, :] <= order[:, None])
         mask = jnp.broadcast_to(mask, (x.shape[0], *mask.shape))
@@ -263,7 +270,7 @@ class ControlTransformer(nn.Module):
             keys.append(jax.lax.dynamic_update_slice(old_keys, jnp.moveaxis(k, 1, -1), (0, 0, 0, place)))
             values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
             x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
-        action = jnp.clip(self._predict(x[:, 2], proprio), -1.0, 1.0)
+        action = jnp.clip(self._predict(x[:, -1], proprio), -1.0, 1.0)
         return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
 
 
@@ -275,7 +282,7 @@ def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Arr
 
 def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
     """The cache before the first step of N episodes."""
-    places = TOKENS * (config.context_acting + 1)
+    places = config.tokens * (config.context_acting + 1)
     empty = jnp.zeros((n, config.heads, config.width // config.heads, places))
     return Cache(
         keys=(empty,) * config.layers,

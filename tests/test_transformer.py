@@ -72,6 +72,15 @@ def test_an_action_is_not_seen_by_itself():
     assert changed_steps(TINY, piece, action=other) == [t + 1, t + 2, t + 3]
 
 
+def test_past_actions_can_be_left_out():
+    """Nothing of them is left, not even parameters, and what else is seen, and when, stays the same."""
+    config, piece, t = replace(TINY, actions=False), episode(0), 3
+    assert changed_steps(config, piece, action=piece["action"] + 1.0) == []
+    assert "embed_action" not in params_of(config)["params"]
+    other = piece["proprio"].at[:, t].set(episode(1)["proprio"][:, t])
+    assert changed_steps(config, piece, proprio=other) == [t, t + 1, t + 2, t + 3]
+
+
 def test_layers_lengthen_the_memory_and_never_turn_it_round():
     """With three layers a step reaches 3 (K - 1) steps ahead, through those between, and never back."""
     config, piece, t = replace(TINY, layers=3, context=3), episode(0), 4
@@ -125,6 +134,14 @@ def test_acting_with_the_cache_is_the_forward_pass(layers, context, acting):
     np.testing.assert_allclose(acted, np.clip(whole, -1.0, 1.0), atol=1e-4)
     if acting != context and acting > 1:
         assert np.abs(predict(config, piece | {"action": acted}) - whole).max() > 1e-3  # the length of memory tells
+
+
+@pytest.mark.parametrize(("layers", "acting"), [(1, 4), (3, 4), (3, 7), (3, 1)])
+def test_acting_without_past_actions_is_the_forward_pass(layers, acting):
+    config = replace(TINY, layers=layers, context_acting=acting, max_timestep=16, actions=False)
+    piece = episode(layers, steps=21)
+    whole = predict(config, piece, context=acting)
+    np.testing.assert_allclose(act_along(config, params_of(config), piece), np.clip(whole, -1.0, 1.0), atol=1e-4)
 
 
 def test_episodes_do_not_see_each_other():
