@@ -3,9 +3,10 @@
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
 With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``, and
-``cpu-ct`` before its fine-tuning), the same trained with noise (``noise``) or in rooms of many densities (``dense``),
-and planner and explorer beside them. The lifted ones of the first seed then meet rooms of 0.5 to 2 times the published
-density, sensors and motion of 0 to 2 times a real robot's errors, and the paper's seven pairs in one fixed room.
+``cpu-ct`` before its fine-tuning), the latter when it sees its own past actions (``cpu-ct-actions``), the former trained
+with noise (``noise``) or in rooms of many densities (``dense``), and planner and explorer beside them. The lifted ones
+of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion of 0 to 2 times a real
+robot's errors, and the paper's seven pairs in one fixed room.
 Everything finished is kept: the same command goes on.
 Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other seeds and variants stay, and the plots
 ``docs/turtlebot3-density.png`` and ``-noise.png``.
@@ -35,7 +36,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu, noise, dense. By default all."""
+    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu-ct-actions, cpu, noise, dense. By default all."""
     sweeps: bool = True
     """Also other densities, levels of noise, and the seven pairs."""
     out: Path = Path("runs/turtlebot3")
@@ -62,6 +63,7 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
             "bc-ct": replace(ct, model=replace(ct.model, returns=False)),
             "f-ct": published,
             "cpu-ct": replace(lifted, rounds=0),
+            "cpu-ct-actions": replace(lifted, rounds=0, model=replace(lifted.model, actions=True)),
             "cpu": lifted,
             "noise": replace(lifted, rooms=replace(lifted.rooms, noise=1.0)),
             "dense": replace(lifted, rooms=replace(lifted.rooms, density=min(DENSITIES), densest=max(DENSITIES))),

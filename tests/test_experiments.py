@@ -112,8 +112,10 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
 
 def test_the_turtlebots_rows_share_what_they_can():
     known = variants_for("cpu")
-    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu", "noise", "dense"]
-    assert replace(known["cpu"], rounds=0) == known["cpu-ct"]
+    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu-ct-actions", "cpu", "noise", "dense"]
+    lifted, seeing = known["cpu-ct"], known["cpu-ct-actions"]
+    assert replace(known["cpu"], rounds=0) == lifted
+    assert replace(seeing, model=lifted.model) == lifted and seeing.model.actions and not lifted.model.actions
     densities = [known[name].rooms.densities for name in ("cpu", "dense")]  # pyright: ignore
     assert densities == [(1.0, 1.0), (0.5, 2.0)]
     ct, bc, fct = (known[name] for name in ("ct", "bc-ct", "f-ct"))
