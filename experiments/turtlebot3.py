@@ -3,10 +3,10 @@
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
 With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``, and
-``cpu-ct`` before its fine-tuning), the latter when it sees its own past actions (``cpu-ct-actions``), the former trained
-with noise (``noise``) or in rooms of many densities (``dense``), and planner and explorer beside them. The lifted ones
-of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion of 0 to 2 times a real
-robot's errors, and the paper's seven pairs in one fixed room.
+``cpu-ct`` before its fine-tuning), the latter when it sees its own past actions (``cpu-ct-actions``), the former
+trained with noise (``noise``) or in rooms of many densities (``dense``), and planner and explorer beside them. The
+lifted ones of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion of 0 to 2
+times a real robot's errors, and the paper's seven pairs in one fixed room.
 Everything finished is kept: the same command goes on.
 Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other seeds and variants stay, and the plots
 ``docs/turtlebot3-density.png`` and ``-noise.png``.
