@@ -222,9 +222,8 @@ def draw_wave(
 
 
 def drive_guided(
-    pool: Turtlebot3Pool, wave: Wave, guide: AnyGuide,
-    controller: DifferentialDrive = DifferentialDrive(), *, noise: float = 0.0,
-    on_progress: Callable[[int, int], None] | None = None,
+    pool: Turtlebot3Pool, wave: Wave, guide: AnyGuide, controller: DifferentialDrive = DifferentialDrive(), *,
+    noise: float = 0.0,
 ) -> list[Drive]:  # fmt: skip
     """Drive a wave led by a guide."""
     driver = GuidedDriver(guide, controller, noise)
@@ -232,7 +231,7 @@ def drive_guided(
     def begin(frame: Frame) -> Any:
         return driver.init(guide.init(frame, wave.episodes, wave.rooms), frame, wave.episodes)
 
-    return drive(pool, wave.episodes, driver, begin, on_progress=on_progress)
+    return drive(pool, wave.episodes, driver, begin)
 
 
 def collect(

@@ -89,18 +89,12 @@ class _Moment(NamedTuple):
 
 
 def drive(
-    pool: Turtlebot3Pool,
-    episodes: Sequence[Episode],
-    driver: Driver,
-    begin: Callable[[Frame], Any],
-    *,
-    on_progress: Callable[[int, int], None] | None = None,
+    pool: Turtlebot3Pool, episodes: Sequence[Episode], driver: Driver, begin: Callable[[Frame], Any]
 ) -> list[Drive]:
     """Drive episodes, one in each slot, to their ends.
 
     Args:
         begin: the driver's memory, from the first frame.
-        on_progress: told (steps, episodes that are over) after every step.
     """
     frame = pool.reset(episodes, range(len(episodes)))
     memory = begin(frame)
@@ -112,8 +106,6 @@ def drive(
         moments.append(_Moment(frame._replace(map=pack_maps(frame.map)), action, after._replace(map=_NOTHING)))
         frame = after
         raise_if_interrupted()
-        if on_progress is not None:
-            on_progress(len(moments), int(frame.done[: len(episodes)].sum()))
     return [_record(moments, slot, episode) for slot, episode in enumerate(episodes)]
 
 

@@ -30,11 +30,14 @@ PLANNER = PrmConfig(samples=400, connect_m=2.0, margin_m=0.03)  # joins what a r
 
 
 def as_state(frame: Frame) -> State:
-    """What a pool shows, as the mazes' policies see it."""
+    """What a pool shows, as the mazes' policies see it.
+
+    The reward is what the robot itself can tell of it. Its place and touches are for whoever watches over a policy.
+    """
     obs = {name: jnp.asarray(getattr(frame, name)) for name in ("map", "proprio", "goal")}
     info = {"position": jnp.asarray(frame.position, jnp.float32)}
     info |= {"collision": jnp.asarray(frame.collision, jnp.float32)}
-    return State(None, obs, jnp.asarray(frame.reward), jnp.asarray(frame.done, jnp.float32), {}, info)
+    return State(None, obs, jnp.asarray(frame.believed_reward), jnp.asarray(frame.done, jnp.float32), {}, info)
 
 
 @jax.jit

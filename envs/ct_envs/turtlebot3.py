@@ -4,8 +4,8 @@ What a policy sees is what the robot itself can give it, in the robot's own fram
 direction of the goal [cos dpsi, sin dpsi], where dpsi is the angle from the heading to the goal; the vector to the goal
 (dx, dy); and the lidar within 1 m as a 2 x 25 x 25 map of 0.08 m cells. The paper gives neither the frame, nor the
 control step, the horizon, the goal tolerance or the penalty. In the robot's frame, raw lidar needs no estimate of the
-yaw, errors of the yaw move no obstacle, and nothing changes when the world is turned; ``frame="world"`` aligns map and
-goal with the world instead, as in the mazes. The other choices are the defaults of ``Turtlebot3Config``.
+yaw, errors of the yaw move no obstacle, and nothing changes when the world is turned. The other choices are the
+defaults of ``Turtlebot3Config``.
 
 PyBullet is imported when the first simulation begins: all else works without it.
 """
@@ -37,10 +37,9 @@ TOP_SPEED_MPS = TURTLEBOT3.top_speed_mps
 TOP_TURN_RADPS = 2.84
 PROPRIO_SIZE = 2  # cos dpsi, sin dpsi
 ACTION_SIZE = 2  # v, omega
-FRAMES = ("heading", "world")
-MAX_NOISE = 5.0
+MAX_NOISE = 2.0  # more delay than a control step is not simulated
 
-_STOP_M = 0.05  # with noise, a robot that believes to be so near to its goal stops there
+_STOP_M = 0.1  # with noise, a robot stops where it believes to be so near: half the tolerance is left to its drift
 _LIDAR_M = 0.18  # height of the beams: above the body, below the top of every obstacle
 _HEIGHT_M = 0.5  # of walls and obstacles
 _TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
@@ -60,13 +59,10 @@ class Turtlebot3Config:
     horizon: int = TURTLEBOT3.horizon  # control steps of an episode
     goal_tolerance_m: float = TURTLEBOT3.goal_tolerance_m
     collision_penalty: float = 1.0  # taken off the reward of a step in which the robot touches something
-    frame: str = "heading"  # of map and goal: the robot's "heading" or the "world"
     urdf: str | None = None  # a URDF file instead of ours
     noise: float = 0.0  # level of what a real robot gets wrong, see ``turtlebot3_noise``; 1 is meant to be real
 
     def __post_init__(self):
-        if self.frame not in FRAMES:
-            raise UserError(f"no frame named '{self.frame}'; frames: {', '.join(FRAMES)}")
         if not 0 < self.physics_dt_s <= self.control_dt_s:
             raise UserError(f"physics_dt_s is {self.physics_dt_s}; use more than 0 and at most control_dt_s")
         if not 0 <= self.noise <= MAX_NOISE:
@@ -127,9 +123,8 @@ def to_heading(vector: Float[np.ndarray, "*n 2"], yaw_rad: Any) -> Float[np.ndar
 
 
 def observe(
-    pose: Pose, goal: Float[np.ndarray, "*b 2"], ranges: Float[np.ndarray, "*b 360"], *, frame: str = "heading",
-    missing_ok: bool = False,
-) -> dict[str, np.ndarray]:  # fmt: skip
+    pose: Pose, goal: Float[np.ndarray, "*b 2"], ranges: Float[np.ndarray, "*b 360"], *, missing_ok: bool = False
+) -> dict[str, np.ndarray]:
     """What a policy sees: ``map`` [*b, 2, 25, 25] of bytes, ``proprio`` [cos dpsi, sin dpsi] and ``goal`` [*b, 2] (m).
 
     Args:
@@ -137,13 +132,11 @@ def observe(
         goal: in the world [m].
         ranges: of the lidar [m]; see ``lidar_map``, also for ``missing_ok``.
     """
-    away, yaw = goal - pose.position, np.asarray(pose.yaw_rad)
-    ahead = to_heading(away, yaw)
+    ahead = to_heading(goal - pose.position, np.asarray(pose.yaw_rad))
     distance = np.linalg.norm(ahead, axis=-1, keepdims=True)
     direction = np.where(distance > 1e-9, ahead / np.maximum(distance, 1e-9), [1.0, 0.0])
-    vector, turned = (away, yaw) if frame == "world" else (ahead, np.zeros_like(yaw))
-    picture = lidar_map(ranges, vector, yaw_rad=turned, missing_ok=missing_ok)
-    return {"map": picture, "proprio": direction.astype(np.float32), "goal": vector.astype(np.float32)}
+    picture = lidar_map(ranges, ahead, missing_ok=missing_ok)
+    return {"map": picture, "proprio": direction.astype(np.float32), "goal": ahead.astype(np.float32)}
 
 
 class Turtlebot3Env:
@@ -153,8 +146,8 @@ class Turtlebot3Env:
     (within the goal tolerance) or, as truncation, at the horizon; a collision does not end it. ``info`` holds
     ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``,
     ``ranges`` and ``believed``. With ``noise``, observations, ``ranges`` and the pose ``believed`` are what the robot
-    has, all else is the truth, and an episode also ends where the robot believes to have arrived. The same world,
-    start, goal, seed and actions give the same episode, bit for bit, whatever was simulated before.
+    has, all else is the truth, and an episode ends where the robot believes to have arrived: with success, if it has.
+    The same world, start, goal, seed and actions give the same episode, bit for bit, whatever was simulated before.
     """
 
     def __init__(self, config: Turtlebot3Config = Turtlebot3Config()):
@@ -213,10 +206,10 @@ class Turtlebot3Env:
         obs, self._sight = self._see()
         distance = float(np.linalg.norm(self._goal - pose.position))
         collision = touch.frontal or touch.grazing
-        success = distance < self.config.goal_tolerance_m
-        truncation = not success and self._steps >= self.config.horizon
-        stopped = bool(self.config.noise) and float(np.linalg.norm(obs["goal"])) < _STOP_M
-        self._done = success or truncation or stopped
+        close = distance < self.config.goal_tolerance_m
+        stopped = float(np.linalg.norm(obs["goal"])) < _STOP_M if self.config.noise else close
+        success, truncation = stopped and close, not stopped and self._steps >= self.config.horizon
+        self._done = stopped or truncation
         info = {
             "success": success, "collision": collision, "frontal": touch.frontal, "grazing": touch.grazing,
             "truncation": truncation, "episode_steps": self._steps, "position": pose.position,
@@ -231,7 +224,7 @@ class Turtlebot3Env:
         else:
             pose = Pose(self._belief.position, self._belief.yaw_rad)
             ranges = self._belief.scan(self.lidar())
-        obs = observe(pose, self._goal, ranges, frame=self.config.frame, missing_ok=bool(self.config.noise))
+        obs = observe(pose, self._goal, ranges, missing_ok=bool(self.config.noise))
         return obs, {"ranges": ranges, "believed": pose}
 
     def sight(self) -> dict[str, Any]:

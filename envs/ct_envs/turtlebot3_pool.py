@@ -51,6 +51,7 @@ class Frame(NamedTuple):
     believed_yaw_rad: np.ndarray  # float64
     ranges: np.ndarray  # float32 [360], [m]
     reward: np.ndarray  # float32
+    believed_reward: np.ndarray  # float32: as the robot can tell by itself, which feels no touch
     done: np.ndarray  # bool, as all that follow
     success: np.ndarray
     collision: np.ndarray
@@ -61,8 +62,7 @@ class Frame(NamedTuple):
 _EMPTY = Frame(
     np.zeros((2, MAP_CELLS, MAP_CELLS), np.uint8), np.zeros(2, np.float32), np.zeros(2, np.float32), np.zeros(2),
     np.zeros(()), np.zeros(2), np.zeros(()), np.zeros(LIDAR_BEAMS, np.float32), np.zeros((), np.float32),
-    np.ones((), bool),
-    *[np.zeros((), bool)] * 4,
+    np.zeros((), np.float32), np.ones((), bool), *[np.zeros((), bool)] * 4,
 )  # fmt: skip
 
 
@@ -164,10 +164,11 @@ class Turtlebot3Pool:
         for number, request in requests.items():
             self._workers[number].send(command, request)
         answers = [self._answer(number, command, request) for number, request in requests.items()]
-        self._asking = any(kind == "crash" for kind, _ in answers)
+        # A crash, or an error in what was driven again, leaves an answer in the pipes.
+        self._asking = any(kind not in ("frames", "error") for kind, _ in answers)
         for kind, answer in answers:
             if kind != "frames":
-                raise (UserError if kind == "error" else RuntimeError)(answer)
+                raise (RuntimeError if kind == "crash" else UserError)(answer)
         return {slot: frame for _, answer in answers for slot, frame in answer.items()}
 
     def _answer(self, number: int, command: str, request: dict[int, Any]) -> tuple[str, Any]:
@@ -201,6 +202,8 @@ class _Worker:
             self.connection.send((command, content))
 
     def end(self) -> None:
+        if self.connection.closed:  # ended before, and no other could be started in its place
+            return
         self.connection.close()
         self.process.kill()
         self.process.join()
@@ -238,7 +241,7 @@ def _work(connection: Connection, config: Turtlebot3Config) -> None:
         try:
             answer = "frames", _COMMANDS[command](envs, config, content)
         except UserError as error:
-            answer = "error", str(error)
+            answer = "replay error" if command == "replay" else "error", str(error)
         except Exception:
             answer = "crash", traceback.format_exc()
         try:
@@ -255,12 +258,16 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
             envs[slot] = Turtlebot3Env(config)
         env = envs[slot]
         obs = env.reset(episode.world, episode.start, episode.goal, seed=episode.seed, yaw_rad=episode.yaw_rad)
-        frames[slot] = _frame(obs, 0.0, False, env.sight())
+        frames[slot] = _frame(obs, 0.0, 0.0, False, env.sight())
     return frames
 
 
 def _step(envs: dict[int, Turtlebot3Env], _: Turtlebot3Config, actions: dict[int, np.ndarray]) -> dict[int, Frame]:
-    return {slot: _frame(*envs[slot].step(action)) for slot, action in actions.items()}
+    steps = {slot: envs[slot].step(action) for slot, action in actions.items()}
+    return {
+        slot: _frame(step.obs, step.reward, -float(np.linalg.norm(step.obs["goal"])), step.done, step.info)
+        for slot, step in steps.items()
+    }
 
 
 def _replay(
@@ -276,10 +283,13 @@ def _replay(
 _COMMANDS = {"reset": _reset, "step": _step, "replay": _replay}
 
 
-def _frame(obs: dict[str, np.ndarray], reward: float, done: bool, info: dict[str, Any]) -> Frame:
+def _frame(
+    obs: dict[str, np.ndarray], reward: float, believed_reward: float, done: bool, info: dict[str, Any]
+) -> Frame:  # fmt: skip
     flags = [np.asarray(info.get(name, False)) for name in ("success", "collision", "frontal", "grazing")]
     return Frame(
         obs["map"], obs["proprio"], obs["goal"], info["position"], np.asarray(info["yaw_rad"]),
         info["believed"].position, np.asarray(info["believed"].yaw_rad),
-        info["ranges"].astype(np.float32), np.float32(reward), np.asarray(done), *flags,
+        info["ranges"].astype(np.float32), np.float32(reward), np.float32(believed_reward), np.asarray(done),
+        *flags,
     )  # fmt: skip
