@@ -161,7 +161,7 @@ def episodes_file(folder: Path, name: str, method: str) -> Path:
 
 def _save_episodes(file: Path, episodes: Episodes) -> None:
     """Write what happened, for the report's pictures."""
-    arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "steps", "returns")}
+    arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "fell", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
     more = {"asked": episodes.asked, "frontal": episodes.frontal, "grazing": episodes.grazing}
     more |= {"world": episodes.pairs.world}

@@ -1,5 +1,7 @@
 """What the experiments share: the method's variants and the baselines, on the same data and the same pairs."""
 
+import hashlib
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -23,7 +25,7 @@ from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
 from ct_jax.mazes import evaluated
-from ct_jax.presets import Settings, get_preset
+from ct_jax.presets import Settings, get_preset, to_dict
 from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
@@ -200,8 +202,15 @@ def share(source: Run, run: Run) -> None:
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     """A row with what made its model, or, where it says so itself, with what measured it later."""
     config = read_json(run.folder / "config.json")
-    wall_s = sum(read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json")))
-    return {"variant": variant, "model_seed": run.seed, "run_wall_s": round(wall_s)} | origin(config) | row
+    walls = {done.parent.name: read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json"))}
+    made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
+    made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
+    return made | origin(config) | row
+
+
+def digest(settings: Settings) -> str:
+    """Some letters that tell settings apart."""
+    return hashlib.sha256(json.dumps(to_dict(settings), sort_keys=True).encode()).hexdigest()[:12]
 
 
 def origin(made: dict[str, Any]) -> dict[str, Any]:
@@ -209,10 +218,12 @@ def origin(made: dict[str, Any]) -> dict[str, Any]:
     return {key: made[key] for key in ("command", "commit", "hardware", "created")}
 
 
-def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, str]:
-    """Which of a row's episodes succeeded, as ones and zeros: methods are compared pair by pair."""
+def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, dict[str, str]]:
+    """What a row's rates count, episode by episode, as ones and zeros: methods are compared pair by pair."""
+    names = {"success": "success", "collision": "collided", "fall": "fell", "frontal": "frontal", "grazing": "grazing"}
     with np.load(episodes_file(folder, row["maze"], row["method"])) as episodes:
-        return {"outcomes": "".join("01"[int(won)] for won in episodes["success"])}
+        flags = {name: episodes[array] for name, array in names.items() if array in episodes}
+    return {"outcomes": {name: "".join("01"[int(flag)] for flag in flags[name]) for name in flags}}
 
 
 # ------------------------------------------------------------------------------------------------------- baselines
@@ -261,16 +272,23 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
 
 
 def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
-    """Write lists of rows; those in the file that were not measured anew, by other commands or earlier, stay."""
+    """Write lists of rows. Those in the file that were not measured anew, by other commands or earlier, stay, unless
+    they are of a variant that had other settings then."""
 
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
         return (*model, *(row.get(name) for name in ("method", "maze", "density", "noise")))
 
     kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
-    for name, rows in found.items():
+    now = {row["variant"]: row.get("settings") for rows in found.values() for row in rows}
+
+    def holds(row: dict[str, Any]) -> bool:
+        return row["method"] in GUIDED or row.get("settings") == now.get(row["variant"], row.get("settings"))
+
+    for name in {**kept, **found}:
+        rows = found.get(name, [])
         anew = {subject(row) for row in rows}
-        kept[name] = [row for row in kept.get(name, []) if subject(row) not in anew] + rows
+        kept[name] = [row for row in kept.get(name, []) if holds(row) and subject(row) not in anew] + rows
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, kept)
 

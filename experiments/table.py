@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ct_jax.evaluate import wilson_of
+from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
+_INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
 def experiment_table(results: dict[str, Any]) -> list[str]:
@@ -29,8 +30,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     for row in sorted(rows, key=lambda row: not row["seen"]):
         together.setdefault((row["seen"], row["maze"], method_name(row)), []).append(row)
     for (seen, maze, name), models in together.items():
-        each = ", ".join(f"{100 * row['success_rate']:.0f}" for row in models) if models[0]["method"] == "ct" else ""
-        cells = [f"{maze} ({'seen' if seen else 'unseen'})", name, pooled(models, "success"), each]
+        cells = [f"{maze} ({'seen' if seen else 'unseen'})", name, pooled(models, "success"), each_model(models)]
         cells += [f"{np.mean([row['spl'] for row in models]):.2f}"]
         cells += [f"{np.mean([row['return_scaled'] for row in models]):.1f}", pooled(models, "collision")]
         cells += [pooled(models, "fall")] if falls else []
@@ -39,12 +39,29 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     pairs = {(row["episodes"], row["seed"]) for row in rows}
     on = "; ".join(f"{n} pairs of seed {seed}" for n, seed in sorted(pairs))
     seeds = ", ".join(str(seed) for seed in sorted({row["model_seed"] for row in rows}))
+    note = f"{commands(rows)}; {on} in each maze; models of seeds {seeds}; {_INTERVALS}; {origin(rows)}"
+    return [*lines, "", f"{note}; {took(rows)}."]
+
+
+def each_model(rows: list[dict[str, Any]]) -> str:
+    """Success of each model in percent, by seed; of a reference, nothing."""
+    if rows[0]["method"] in GUIDED:
+        return ""
+    return ", ".join(
+        f"{round(100 * row['success_rate'], 1):g}" for row in sorted(rows, key=lambda row: row["model_seed"])
+    )
+
+
+def took(rows: list[dict[str, Any]]) -> str:
+    """How long the models took, and their trajectories."""
     walls: dict[str, list[float]] = {}
     for row in rows:
         walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
-    took = ", ".join(f"{variant} {np.mean(minutes):.0f} min" for variant, minutes in walls.items())
-    note = f"{commands(rows)}; {on} in each maze; models of seeds {seeds}; 95 % intervals; {origin(rows)}"
-    return [*lines, "", f"{note}; a model takes: {took}."]
+    words = "a model takes: " + ", ".join(f"{name} {np.mean(minutes):.0f} min" for name, minutes in walls.items())
+    collecting = [row["collect_wall_s"] / 60 for row in rows if row.get("collect_wall_s")]
+    if collecting:
+        words += f" (of them, for the planning trajectories: {min(collecting):.1f} to {max(collecting):.1f})"
+    return words
 
 
 def method_name(row: dict[str, Any]) -> str:
@@ -61,17 +78,20 @@ def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> 
     for (seen, maze, name), tuned in together.items():
         plain = together.get((seen, maze, "CT"))
         if name == "F-CT" and plain is not None:
-            of_seed = {row["model_seed"]: won(row) for row in plain}
-            changes = [won(row) - of_seed[row["model_seed"]] for row in tuned if row["model_seed"] in of_seed]
+            of_seed = {row["model_seed"]: flags(row, "success") for row in plain}
+            pairs = [
+                (flags(row, "success"), of_seed[row["model_seed"]]) for row in tuned if row["model_seed"] in of_seed
+            ]
+            changes = [after - before for after, before in pairs]
             low, high = interval_of_mean(np.stack(changes))
             mean = 100 * np.mean(changes)
             lines += [f"{maze}: F-CT less CT {mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) of 100"]
     return ["", "; ".join(lines) + "."] if lines else []
 
 
-def won(row: dict[str, Any]) -> np.ndarray:
-    """Outcomes of a row's episodes, 0 or 1, [n]."""
-    return np.array([int(digit) for digit in row["outcomes"]])
+def flags(row: dict[str, Any], name: str) -> np.ndarray:
+    """What a row's rate of that name counts, 0 or 1, of each episode [n]."""
+    return np.array([int(digit) for digit in row["outcomes"][name]])
 
 
 def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
@@ -85,7 +105,7 @@ def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
 
 def room_table(results: dict[str, Any]) -> list[str]:
     """One line for each variant and reference, its models together; then densities, levels of noise, seven pairs."""
-    names = ["model", "density", "noise", "success %", "SPL", "frontal %", "grazing %"]
+    names = ["model", "density", "noise", "success %", "each model", "SPL", "frontal %", "grazing %"]
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     together: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
     sweeps = [*results.get("density", []), *results.get("noise", [])]
@@ -94,8 +114,9 @@ def room_table(results: dict[str, Any]) -> list[str]:
     for (name, density, noise), rows in together.items():
         spl = sum(row["spl"] for row in rows) / len(rows)
         name = name if len(rows) == 1 else f"{name}, {len(rows)} models"
-        rates = [pooled(rows, rate) for rate in ("success", "frontal", "grazing")]
-        lines.append("| " + " | ".join([name, f"{density:g}", f"{noise:g}", rates[0], f"{spl:.2f}", *rates[1:]]) + " |")
+        success, *touched = (pooled(rows, rate) for rate in ("success", "frontal", "grazing"))
+        cells = [name, f"{density:g}", f"{noise:g}", success, each_model(rows), f"{spl:.2f}", *touched]
+        lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "| model | noise | seven pairs: full | partial | failed |", "|---|---|---|---|---|"]
     for row in results.get("seven", []):
         name = f"{row['variant']}, seed {row['model_seed']}" if row["method"] == "ct" else row["method"]
@@ -104,7 +125,7 @@ def room_table(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
     on = f"{rows[0]['worlds']} random rooms, {rows[0]['pairs']} pairs in each, of seed {rows[0]['seed']}"
     on += f" ({sweeps[0]['pairs']} where density or noise is another)" if sweeps else ""
-    note = f"{commands(rows + sweeps)}; {on}; 95 % intervals; {origin(rows + sweeps)}."
+    note = f"{commands(rows + sweeps)}; {on}; {_INTERVALS}; {origin(rows + sweeps)}; {took(rows)}."
     return [*lines, "", note]
 
 
@@ -149,10 +170,16 @@ def origin(rows: list[dict[str, Any]]) -> str:
 
 
 def pooled(rows: list[dict[str, Any]], name: str) -> str:
-    """A rate of all models together, in percent with its interval."""
+    """A rate of all models together, in percent with its interval.
+
+    Models differ, and meet the same pairs: several are as uncertain as a bootstrap over both says, if that is more.
+    """
     n = sum(row["episodes"] for row in rows)
     low, high = wilson_of(sum(round(row[f"{name}_rate"] * row["episodes"]) for row in rows), n)
     rate = sum(row[f"{name}_rate"] * row["episodes"] for row in rows) / n
+    if len(rows) > 1 and all(name in row.get("outcomes", ()) for row in rows):
+        ends = interval_of_mean(np.stack([flags(row, name) for row in rows]))
+        low, high = min(low, ends[0]), max(high, ends[1])
     return f"{100 * rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
 
 

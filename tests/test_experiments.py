@@ -1,5 +1,6 @@
 """The experiments' plans: which rows there are, and that all of them are made and kept."""
 
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -10,14 +11,15 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from _variants import Baselines, Plan, plan_for, run_plan, share, write_results
-from table import differences, interval_of_mean, room_table, transfer_table
+from _variants import Baselines, Plan, digest, plan_for, run_plan, share, write_results
+from table import differences, interval_of_mean, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
 
 from ct_envs import MazeEnv, UserError
 from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.checkpoint import read_json
+from ct_jax.presets import get_preset
 from ct_jax.run import Run, load_mazes
 
 MADE = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00"}
@@ -95,9 +97,24 @@ def test_rows_of_other_sittings_stay_in_the_results(tmp_path):
     assert found["noise"] == [row("ct", 0, 0.3)]
 
 
+def test_rows_of_other_settings_do_not_stay_under_the_same_name(tmp_path):
+    """A variant that was changed is measured anew, all of it: no table joins what was trained in two ways."""
+
+    def row(variant, seed, settings, method="ct"):
+        return {"variant": variant, "model_seed": seed, "settings": settings, "method": method, "maze": "m"}
+
+    file = tmp_path / "results.json"
+    old = [row("cpu", 0, "old"), row("cpu", 1, "old"), row("cpu", 0, "old", "planner"), row("ct", 0, "ct's")]
+    write_results(file, {"rows": old, "noise": [row("cpu", 0, "old")]})
+    write_results(file, {"rows": [row("cpu", 0, "new")]})
+    assert read_json(file) == {"rows": [*old[2:], row("cpu", 0, "new")], "noise": []}
+    settings = get_preset("cpu")
+    assert digest(settings) == digest(get_preset("cpu")) != digest(replace(settings, rounds=1))
+
+
 def test_what_fine_tuning_adds_is_told_pair_by_pair():
     def row(variant, seed, outcomes):
-        return {"variant": variant, "method": "ct", "model_seed": seed, "outcomes": outcomes}
+        return {"variant": variant, "method": "ct", "model_seed": seed, "outcomes": {"success": outcomes}}
 
     half = "01" * 50
     rows = {"CT": [row("published", 0, half), row("published", 1, half)],
@@ -108,6 +125,21 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
     assert with_itself == (0.0, 0.0)
     low, high = interval_of_mean(np.tile([0.0, 1.0], (3, 50)))
     assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # as a binomial's, were models alike
+
+
+def test_models_that_differ_are_less_certain_than_episodes_are_many():
+    """Rates of 88, 84 and 78 of 100 are not known to two of 100; three that agree are, and one is as Wilson says."""
+
+    def row(rate):
+        flags = "1" * round(500 * rate) + "0" * round(500 * (1 - rate))
+        return {"episodes": 500, "success_rate": rate, "outcomes": {"success": flags}}
+
+    def width(*rates):
+        low, high = re.findall(r"\((\d+) to (\d+)\)", pooled([row(rate) for rate in rates], "success"))[0]
+        return int(high) - int(low)
+
+    assert width(0.884, 0.836, 0.78) >= 8
+    assert width(0.836) in (6, 7) and width(0.836, 0.836, 0.836) in (6, 7)  # the same pairs three times
 
 
 def test_the_turtlebots_rows_share_what_they_can():
@@ -133,12 +165,15 @@ def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
         rates = {"success_rate": success, "frontal_rate": 0.0, "grazing_rate": 0.1}
         made = MADE | {"worlds": 20, "pairs": 25}
         what = {"variant": variant, "method": "ct", "model_seed": seed, "density": density, "noise": 0.0, "spl": 0.5}
-        return what | rates | made | {"episodes": 500, "seed": 0} | more
+        return what | rates | made | {"episodes": 500, "seed": 0, "run_wall_s": 600, "collect_wall_s": 300} | more
 
     rows = [row("ct", 0, 1.0, 0.9), row("ct", 1, 1.0, 1.0)]
     seven = [row("ct", 0, 1.0, 0.9, full=60, partial=5, failed=5)]
     lines = room_table({"rows": rows, "density": [row("ct", 0, 1.5, 0.8)], "seven": seven})
     assert [line.split(" | ")[3] for line in lines[2:4]] == ["95.0 (93 to 96)", "80.0 (76 to 83)"]
+    assert "| 90, 100 |" in lines[2] and lines[-1].endswith(
+        "ct 10 min (of them, for the planning trajectories: 5.0 to 5.0)."
+    )
     assert "ct, 2 models" in lines[2] and any("| 60 | 5 | 5 |" in line for line in lines)
 
 
