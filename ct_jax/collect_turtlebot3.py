@@ -95,7 +95,7 @@ class Following(NamedTuple):
 class WayGuide:
     """The roadmap's shortest way from start to goal, point after point (paper, sec. III-A)."""
 
-    waypoint_tolerance_m: float = 0.06  # less than the margin: who turns off earlier cuts the corner
+    waypoint_tolerance_m: float = 0.06  # who turns off earlier cuts the corner
 
     def init(self, frame: Frame, episodes: Sequence[Episode], rooms: Sequence[Room]) -> Following:
         """At the beginning of the ways of the first slots."""
