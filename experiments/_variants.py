@@ -5,7 +5,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,13 @@ from ct_jax.run import (
     join_mazes,
     load_mazes,
     open_run,
+    provenance,
     training,
 )
 
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
+ALONE = 8000  # iterations that SAC alone has at least: of the point, 500 whole episodes
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, cpu, baselines (which need published). By default all."""
+    """Rows to run: published, bc, f-ct, cpu, baselines (which learn from published's data). By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -96,11 +98,11 @@ class Plan:
 def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, ...] = ()) -> Plan:
     """The rows of a robot's table, or those of them that are named.
 
-    With "cpu": the method as published at the CPU's size, without returns (BC-CT), fine-tuned (F-CT, Algorithm 4), the
-    preset with what lifts it, and the baselines.
+    The method as published, at the size of the preset (with "cpu", that of "published"), without returns (BC-CT) and
+    fine-tuned (F-CT, Algorithm 4); the baselines; with "cpu" what lifts the method; with "demo" that alone.
 
     Raises:
-        UserError: a variant that the preset does not have.
+        UserError: a variant that the preset does not have, or baselines without their data.
     """
     plan = _whole_plan(robot, preset, controller=controller)
     known = [*plan.variants, *(["baselines"] if plan.baselines else [])]
@@ -109,15 +111,19 @@ def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, .
             raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {', '.join(known)}")
     if not variants:
         return plan
+    if "baselines" in variants and "published" not in variants:
+        raise UserError("the baselines learn from the data of 'published': name it, too")
     chosen = {name: settings for name, settings in plan.variants.items() if name in variants}
-    return Plan(chosen, plan.baselines if {"baselines", "published"} <= set(variants) else None)
+    return Plan(chosen, plan.baselines if "baselines" in variants else None)
 
 
 def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
-    lifted = replace(get_preset(preset, robot), controller=controller)
-    if preset != "cpu":
-        return Plan({preset: lifted})
-    published = replace(get_preset("published", robot), controller=controller)
+    if preset == "demo":
+        return Plan({preset: replace(get_preset(preset, robot), controller=controller)})
+    published, lifted = (
+        replace(get_preset(name, robot), controller=controller)
+        for name in ("published" if preset == "cpu" else preset, "cpu")
+    )
     variants: dict[str, Settings] = {
         "published": published,
         "bc": replace(published, model=replace(published.model, returns=False)),
@@ -127,12 +133,14 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             rounds=1,
             round_fit=replace(published.fit, updates=published.fit.updates // 2, warmup=20),
         ),
-        preset: lifted,
     }
+    if preset == "cpu":
+        variants[preset] = lifted
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)
     # Alone, the maze is the task: longer ways, so a longer view, and no edges to arrange.
-    sac = replace(lifted.sac, discount=0.99, iterations=lifted.sac.iterations // 2, alive_bonus=0.0, **EDGES_ONLY)
+    iterations = max(lifted.sac.iterations // 2, ALONE)
+    sac = replace(lifted.sac, discount=0.99, iterations=iterations, reward_scale=0.1, alive_bonus=0.0, **EDGES_ONLY)
     return Plan(variants, Baselines(cql, sac))
 
 
@@ -142,7 +150,7 @@ def run_plan(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and evaluate everything with each seed, continuing what is there; returns all rows.
 
-    The references, planner and explorer, are the same in every run and appear once.
+    The references, planner and explorer, appear once for each roadmap's margin, which they keep, too.
 
     Args:
         keep: told all rows so far after each model.
@@ -151,6 +159,7 @@ def run_plan(
     seen, unseen = default_mazes(robot)
     rows: list[dict[str, Any]] = []
     before: list[Run] = []
+    margins: set[float | None] = set()
     for seed in seeds:
         for place, (name, settings) in enumerate(plan.variants.items()):
             run = Run(
@@ -164,12 +173,18 @@ def run_plan(
             found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
             if place == 0 and plan.baselines is not None:
                 found += run_baselines(run, plan.baselines)
-            if before:
+            if margin(run) in margins:
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
+            margins.add(margin(run))
             keep(rows)
     return rows
+
+
+def margin(run: Run) -> float | None:
+    """What planner and explorer keep to walls in a run's mazes [m]; in rooms they have a setting of their own."""
+    return None if run.settings.rooms else run.settings.prm.margin_m
 
 
 def share(source: Run, run: Run) -> None:
@@ -204,6 +219,8 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     config = read_json(run.folder / "config.json")
     walls = {done.parent.name: read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json"))}
     made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
+    if row["method"] in GUIDED and margin(run) is not None:
+        made["margin_m"] = margin(run)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     return made | origin(config) | row
 
@@ -242,18 +259,23 @@ def run_baselines(run: Run, baselines: Baselines) -> list[dict[str, Any]]:
         return train_sac_alone(key, run.env, next(iter(run.mazes.values())), sac, **watch)
 
     cql = baselines.cql
-    rows = _baseline(run, "pt-cql", learn_cql, cql.updates, cql.width, cql.frame)
-    return rows + _baseline(run, "sac", learn_sac, sac.iterations, sac.hidden[0], sac.frame)
+    return _baseline(run, "pt-cql", learn_cql, cql, cql.updates, cql.width) + _baseline(
+        run, "sac", learn_sac, sac, sac.iterations, sac.hidden[0]
+    )
 
 
-def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, frame: str) -> list[dict[str, Any]]:
+def _baseline(
+    run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
+) -> list[dict[str, Any]]:
     """Rows of one baseline, learned unless its weights are there."""
+    frame = config.frame
     folder = run.folder / "baselines" / name
     folder.mkdir(parents=True, exist_ok=True)
     env = run.env(auto_reset=False)
     actor = Actor(env.action_size, width, frame)
     params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
     policy = ActorPolicy(params, env.action_size, width, frame)
+    made = _made(folder / "baseline.json", config)
     file = folder / "weights.safetensors"
     if not file.is_file():
         metrics = Metrics(folder)
@@ -265,7 +287,18 @@ def _baseline(run: Run, name: str, learn: Callable, total: int, width: int, fram
     policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
     mazes = join_mazes(run.mazes, run.eval_mazes).items()
     rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
-    return [row | outcomes(folder, row) for row in rows]
+    return [made | row | outcomes(folder, row) for row in rows]
+
+
+def _made(file: Path, config: CqlConfig | SacConfig) -> dict[str, Any]:
+    """What made a baseline, written down when its training begins. Raises UserError if that had other settings."""
+    settings = json.loads(json.dumps(asdict(config)))  # tuples as lists, as they are read back
+    if not file.is_file():
+        write_json(file, {"settings": settings} | origin(provenance()))
+    before = read_json(file)
+    if before["settings"] != settings:
+        raise UserError(f"{file.parent}: was made with other settings; delete it, and it is learned anew")
+    return origin(before)
 
 
 # --------------------------------------------------------------------------------------------------------- results
@@ -277,7 +310,7 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
 
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
-        return (*model, *(row.get(name) for name in ("method", "maze", "density", "noise")))
+        return (*model, *(row.get(name) for name in ("method", "maze", "margin_m", "density", "noise")))
 
     kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
     now = {row["variant"]: row.get("settings") for rows in found.values() for row in rows}

@@ -65,8 +65,10 @@ def took(rows: list[dict[str, Any]]) -> str:
 
 
 def method_name(row: dict[str, Any]) -> str:
-    """What the paper calls a row's method; of other variants, the name."""
+    """What the paper calls a row's method; of other variants, the name; of references, also their margin."""
     method, variant = str(row["method"]), str(row["variant"])
+    if method in GUIDED:
+        return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
     if method != "ct":
         return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
     return {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"}.get(variant, f"CT, `{variant}`")

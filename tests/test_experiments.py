@@ -12,10 +12,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Baselines, Plan, digest, plan_for, run_plan, share, write_results
-from table import differences, interval_of_mean, pooled, room_table, transfer_table
+from table import differences, interval_of_mean, method_name, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
 
 from ct_envs import MazeEnv, UserError
+from ct_envs.robots import get_robot
 from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.checkpoint import read_json
@@ -45,6 +46,19 @@ def test_variants_can_be_chosen_and_unknown_ones_are_refused():
     assert plan_for("ant", "cpu", controller="zoo", variants=("published", "baselines")).baselines is not None
     with pytest.raises(UserError, match="no variant named 'gpu' with preset 'cpu'; variants: published, bc, f-ct, cpu"):
         plan_for("point", "cpu", controller="own", variants=("gpu",))
+    with pytest.raises(UserError, match="name it, too"):
+        plan_for("point", "cpu", controller="own", variants=("baselines", "cpu"))
+
+
+def test_every_size_has_every_method_of_the_paper():
+    paper = plan_for("ant", "paper", controller="zoo")
+    assert list(paper.variants) == ["published", "bc", "f-ct"] and paper.baselines is not None
+    sizes = [(settings.model.width, settings.fit.updates, settings.controller) for settings in paper.variants.values()]
+    assert sizes == [(512, 75_000, "zoo")] * 3
+    assert list(plan_for("ant", "demo", controller="own").variants) == ["demo"]
+    for robot in ("point", "ant"):
+        baselines = plan_for(robot, "cpu", controller="zoo").baselines
+        assert baselines is not None and baselines.sac.iterations >= 8 * get_robot(robot).horizon
 
 
 def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path, monkeypatch):
@@ -59,6 +73,31 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path
     assert all(row["episodes"] == 4 and row["seed"] == 0 and row["variant"] == "one" for row in rows)
     monkeypatch.setattr("_variants.train_cql", None)
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
+    other = Plan(plan.variants, Baselines(replace(cql, updates=3), plan.baselines.sac))  # pyright: ignore
+    with pytest.raises(UserError, match="other settings; delete it"):
+        run_plan("point", other, preset="tiny", seeds=(0,), out=tmp_path)
+
+
+def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeypatch):
+    """What keeps away from walls is another planner: it stands beside what was taught by it."""
+    plan = Plan({
+        "one": tiny_settings, "two": replace(tiny_settings, rounds=2),
+        "wary": replace(tiny_settings, prm=replace(tiny_settings.prm, margin_m=0.3)),
+    })  # fmt: skip
+    monkeypatch.setattr("_variants.pipeline.train", lambda run, resume: None)
+    monkeypatch.setattr("_variants.share", lambda source, run: None)
+    monkeypatch.setattr("_variants.outcomes", lambda folder, row: {})
+    monkeypatch.setattr("_variants.read_json", lambda file: MADE)
+    found = [{"method": method, "maze": "m"} for method in ("ct", "planner")]
+    monkeypatch.setattr("_variants.pipeline.results", lambda folder: found)
+    rows = run_plan("point", plan, preset="tiny", seeds=(0, 1), out=tmp_path)
+    planners = [row for row in rows if row["method"] == "planner"]
+    assert [(row["variant"], row["margin_m"]) for row in planners] == [
+        ("one", tiny_settings.prm.margin_m),
+        ("wary", 0.3),
+    ]
+    assert [method_name(row) for row in planners] == ["planner", "planner, 0.3 m off walls"]
+    assert len(rows) == 2 * 3 + 2
 
 
 def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_path):

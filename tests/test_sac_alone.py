@@ -46,6 +46,13 @@ def test_a_few_iterations(learner, fresh):
     assert np.isfinite([float(value) for value in metrics.values()]).all()
 
 
+def test_its_critics_have_the_controllers_norm(fresh):
+    normed = SacAlone(ENV(maps=False), replace(TINY, critic_norm=True)).create(jax.random.key(0), UMAZE, None)
+    found = ["LayerNorm" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(normed.critic)]
+    assert any(found) and not all(found)
+    assert not any("LayerNorm" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(fresh.critic))
+
+
 def test_maps_are_recomputed_as_they_were(learner, fresh):
     """From what the replay keeps, the networks see what an environment with maps shows."""
     inputs = learner._see(learner._observe(fresh.env), UMAZE)

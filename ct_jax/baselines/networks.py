@@ -67,6 +67,7 @@ class Critics(nn.Module):
 
     width: int
     frame: str = "world"
+    norm: bool = False  # layer norm after the hidden layers
 
     @nn.compact
     def __call__(self, seen: Seen, action: Float[Array, "*b M A"]) -> Float[Array, "*b M 2"]:
@@ -75,7 +76,9 @@ class Critics(nn.Module):
         for _ in range(2):
             # A dense layer of both, written as a sum: the state's share is computed once for its M actions.
             y = nn.relu(nn.Dense(self.width)(x) + nn.Dense(self.width, use_bias=False)(action))
+            y = nn.LayerNorm()(y) if self.norm else y
             y = nn.relu(nn.Dense(self.width)(y))
+            y = nn.LayerNorm()(y) if self.norm else y
             values.append(nn.Dense(1)(y))
         return jnp.concatenate(values, -1)
 

@@ -41,7 +41,7 @@ class SacAlone(Sac):
 
     def _make_networks(self) -> sac_networks.SACNetworks:
         size, width, frame = self.env.action_size, self.config.hidden[0], self.config.frame
-        actor, critics = Actor(size, width, frame), Critics(width, frame)
+        actor, critics = Actor(size, width, frame), Critics(width, frame, self.config.critic_norm)
         see = sample_seen(self.env.proprio_size)
         policy = FeedForwardNetwork(
             init=lambda key: actor.init(key, see),
