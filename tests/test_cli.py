@@ -76,6 +76,14 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
         assert row[name] == pytest.approx(whole[0][name]), name
 
 
+def test_without_pybullet_every_other_robot_works(tiny_run, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 2
+    assert "needs PyBullet" in refused(capsys, "evaluate", "zoo:turtlebot3", "--worlds", "1", "--pairs", "1")
+
+
 def test_evaluate_prints_a_table_for_people(tiny, tiny_run, tmp_path, capsys):
     arguments = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4"]
     assert main([*arguments, "--picture", str(tmp_path / "paths.svg")]) == 0
