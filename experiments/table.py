@@ -139,7 +139,8 @@ def line_of(row: dict[str, Any]) -> str:
 def transfer_table(results: dict[str, Any]) -> list[str]:
     """One line for each robot and start: success after so many updates, and when 90 % of the final one was there.
 
-    The final success is the better of both starts' means after the last update.
+    The final success is the better of both starts' means after the last update. Between two of the numbers of updates
+    success is taken to grow with their logarithm.
     """
     rows = results["rows"]
     marks = sorted({row["updates"] for row in rows})
@@ -151,12 +152,22 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
         means[start] = [np.mean([r["success_rate"] for r in mine if r["updates"] == mark]) for mark in marks]
     for (robot, start), curve in means.items():
         enough = 0.9 * max(other[-1] for (of, _), other in means.items() if of == robot)
-        reached = next((str(mark) for mark, mean in zip(marks, curve, strict=True) if mean >= enough), "later")
+        reached = _reached(marks, curve, enough)
         how = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
         lines.append("| " + " | ".join([robot, how, *(f"{100 * mean:.0f}" for mean in curve), reached]) + " |")
     seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows}))
     on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of seeds {seeds}"
     return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+
+
+def _reached(marks: list[int], curve: list[float], enough: float) -> str:
+    """After how many updates a curve had so much, interpolated between the marks."""
+    at = next((i for i, mean in enumerate(curve) if mean >= enough), None)
+    if not at:
+        return "later" if at is None else f"at most {marks[0]}"
+    before, after = curve[at - 1 : at + 1]
+    share = (enough - before) / (after - before)
+    return f"{marks[at - 1] * (marks[at] / marks[at - 1]) ** share:.0f}"
 
 
 def commands(rows: list[dict[str, Any]]) -> str:

@@ -19,7 +19,8 @@ import tyro
 from _variants import origin
 from matplotlib.figure import Figure
 
-from ct_envs import MazeEnv, load_maze, stack_mazes
+from ct_envs import Maze, MazeEnv, UserError, stack_mazes
+from ct_envs.maze import make_maze, parse_walls
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax
@@ -27,7 +28,7 @@ from ct_jax.evaluate import draw_pairs, evaluate
 from ct_jax.fit import Fit, fit, init_params, transformer_loss
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.progress import Bar
-from ct_jax.run import default_mazes, provenance
+from ct_jax.run import provenance
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
 
@@ -61,6 +62,8 @@ class Target:
     data: Trajectories
     env: MazeEnv
     learner: Fit
+    mazes: Maze  # that the trajectories are in, stacked
+    unseen: tuple[str, Maze]  # the first one of the run's evaluation
 
     @staticmethod
     def of(run: Path, updates: int) -> "Target":
@@ -71,7 +74,15 @@ class Target:
         config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
         env = MazeEnv(model.robot, map_cell_m=settings.model.map_cell_m, auto_reset=False)
         learner = Fit(transformer_loss(model.policy.model), config, settings.model.map_cell_m, env.robot)
-        return Target(model, storage.concatenate([storage.load(file) for file in files]), env, learner)
+        made = read_json(run / "config.json")
+        seen, unseen = (
+            {name: make_maze(parse_walls(text, source=name)) for name, text in made[key].items()}
+            for key in ("mazes", "eval_mazes")
+        )
+        if not unseen:
+            raise UserError(f"{run}: was evaluated in no maze but its own; train with --eval-maze")
+        data = storage.concatenate([storage.load(file) for file in files])
+        return Target(model, data, env, learner, stack_mazes(list(seen.values())), next(iter(unseen.items())))
 
 
 def curve(target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path) -> list[dict]:
@@ -80,9 +91,7 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
     params = init_params(init_key, target.model.policy.model, target.data)
     if source is not None:
         params = transfer(source.policy.params, params)
-    seen, unseen = default_mazes(target.model.robot)
-    mazes, maze = stack_mazes([load_maze(name) for name in seen]), load_maze(unseen[0])
-    robot = target.env.robot
+    robot, (name, maze) = target.env.robot, target.unseen
     pairs = draw_pairs(0, maze, options.episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     # Saved after every chunk, so that each mark goes on from the one before.
     checkpoints = Checkpoints(folder / "checkpoints", every_s=0.0)
@@ -92,12 +101,12 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
             file = folder / f"{mark}.json"
             if not file.is_file():
                 params_now = fit(
-                    fit_key, target.learner, params, target.data, mazes, updates=mark, checkpoints=checkpoints,
+                    fit_key, target.learner, params, target.data, target.mazes, updates=mark, checkpoints=checkpoints,
                     on_progress=lambda update, loss: bar.update(update, f"loss {loss:.4f}"),
                 )  # fmt: skip
                 policy = replace(target.model.policy, params=params_now)
                 episodes = evaluate(target.env, maze, pairs, "ct", policy=policy)
-                row = {"updates": mark, "maze": unseen[0], "episodes": options.episodes} | episodes.summary()
+                row = {"updates": mark, "maze": name, "episodes": options.episodes} | episodes.summary()
                 write_json(file, row | origin(made))
             rows.append(read_json(file))
     checkpoints.close()
@@ -114,10 +123,19 @@ def measure(options: Options) -> list[dict[str, Any]]:
             for start in ("scratch", "transfer"):
                 source = make(other).model if start == "transfer" else None
                 folder = options.out / robot / f"{start}-{seed}"
-                folder.mkdir(parents=True, exist_ok=True)
+                _claim(folder, {"robot": runs[robot], "other": runs[other], "episodes": options.episodes})
                 head = {"robot": robot, "start": other if source else "scratch", "seed": seed}
                 rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
     return rows
+
+
+def _claim(folder: Path, of: dict[str, Any]) -> None:
+    """Make a curve's folder, or take it. Raises UserError if the curve in it is of something else."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file, mine = folder / "curve.json", {key: str(value) for key, value in of.items()}
+    if file.is_file() and read_json(file) != mine:
+        raise UserError(f"{folder}: holds a curve of other runs or pairs; delete it, or choose another with --out")
+    write_json(file, mine)
 
 
 def draw(rows: list[dict[str, Any]], file: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 import transfer as experiment
 
-from ct_envs import UserError
+from ct_envs import UserError, load_maze, stack_mazes
 from ct_jax.transfer import BODY, transfer
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 
@@ -20,9 +20,9 @@ pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 SIZE = {"layers": 1, "heads": 2, "width": 16, "context": 4, "context_acting": 4}
 
 
-def params(seed, proprio, actions, **changes):
-    model = ControlTransformer(ModelConfig(**(SIZE | changes)), actions)
-    return model.init(jax.random.key(seed), *sample_inputs(proprio, actions))
+def params(seed, proprio, motors, **changes):
+    model = ControlTransformer(ModelConfig(**(SIZE | changes)), motors)
+    return model.init(jax.random.key(seed), *sample_inputs(proprio, motors))
 
 
 @pytest.mark.parametrize(("proprio", "actions", "frame"), [(27, 8, "heading"), (27, 8, "world"), (2, 2, "world")])
@@ -36,9 +36,13 @@ def test_the_trunk_is_kept_and_the_body_is_fresh(proprio, actions, frame):
         jax.tree.map(np.testing.assert_array_equal, leaves, whose["params"][name])
 
 
-def test_transfer_to_itself_changes_only_the_body():
-    source = params(0, 2, 2)
-    jax.tree.map(np.testing.assert_array_equal, transfer(source, source), source)
+def test_a_trunk_may_come_from_a_model_that_sees_its_actions_or_not():
+    """What becomes of past actions is the body's."""
+    blind, seeing = params(0, 2, 2, actions=False), params(1, 27, 8)
+    assert "embed_action" not in transfer(seeing, blind)["params"]
+    moved = transfer(blind, seeing)["params"]
+    jax.tree.map(np.testing.assert_array_equal, moved["embed_action"], seeing["params"]["embed_action"])
+    jax.tree.map(np.testing.assert_array_equal, moved["embed_return"], blind["params"]["embed_return"])
 
 
 @pytest.mark.parametrize("changes", [{"width": 32}, {"max_timestep": 64}])
@@ -56,6 +60,9 @@ def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path)
     """Two marks on the way end where one fit does, and a second call has nothing left to do."""
     options = experiment.Options(point=tiny_run.folder, ant=tiny_run.folder, episodes=4, out=tmp_path)
     target = experiment.Target.of(tiny_run.folder, 40)
+    trained_in = load_maze(tiny_run.arguments[tiny_run.arguments.index("--maze") + 1])
+    jax.tree.map(np.testing.assert_array_equal, target.mazes, stack_mazes([trained_in]))
+    assert target.unseen[0] == "antmaze-umaze"
     ends = []
     for marks in ((20, 40), (40,)):
         folder = tmp_path / str(len(marks))
@@ -65,6 +72,10 @@ def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path)
         assert experiment.curve(target, None, 0, replace(options, marks=marks), folder) == rows
         ends.append({key: value for key, value in rows[-1].items() if key not in ("wall_s", "created")})
     assert ends[0] == ends[1]
+    experiment._claim(tmp_path / "a", {"episodes": 4})
+    experiment._claim(tmp_path / "a", {"episodes": 4})
+    with pytest.raises(UserError, match="other runs or pairs"):
+        experiment._claim(tmp_path / "a", {"episodes": 5})
     both = [{"robot": robot, "start": "scratch"} | row for robot in ("ant", "point") for row in rows]
     experiment.draw(both, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 0
