@@ -183,7 +183,13 @@ def origin(rows: list[dict[str, Any]]) -> str:
 
 
 def pooled(rows: list[dict[str, Any]], name: str) -> str:
-    """A rate of all models together, in percent with its interval.
+    """A rate of all models together, in percent with its interval."""
+    rate, low, high = rate_of(rows, name)
+    return f"{rate:.1f} ({low:.0f} to {high:.0f})"
+
+
+def rate_of(rows: list[dict[str, Any]], name: str) -> tuple[float, float, float]:
+    """A rate of all models together and the ends of its interval [%].
 
     Models differ, and meet the same pairs: several are as uncertain as a bootstrap over both says, if that is more.
     """
@@ -193,7 +199,7 @@ def pooled(rows: list[dict[str, Any]], name: str) -> str:
     if len(rows) > 1 and all(name in row.get("outcomes", ()) for row in rows):
         ends = interval_of_mean(np.stack([flags(row, name) for row in rows]))
         low, high = min(low, ends[0]), max(high, ends[1])
-    return f"{100 * rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+    return 100 * rate, 100 * low, 100 * high
 
 
 def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:

@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
 DENSITIES = (0.5, 1.5, 2.0)  # besides 1, in which every variant is measured
@@ -133,23 +135,17 @@ def _kept(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) -> None:
     """Plot success against ``axis``, a line for each variant and reference, with 95 % intervals of all its models."""
     from matplotlib.figure import Figure
-    from table import line_of
-
-    from ct_jax.evaluate import wilson_of
+    from table import line_of, rate_of
 
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     ax = figure.add_subplot()
-    lines: dict[str, dict[float, list[tuple[int, int]]]] = {}
+    lines: dict[str, dict[float, list[dict[str, Any]]]] = {}
     for row in rows:
-        counts = round(row["success_rate"] * row["episodes"]), row["episodes"]
-        lines.setdefault(line_of(row), {}).setdefault(row[axis], []).append(counts)
+        lines.setdefault(line_of(row), {}).setdefault(row[axis], []).append(row)
     for name, points in lines.items():
         x = sorted(points)
-        won, of = (([sum(count[i] for count in points[at]) for at in x]) for i in (0, 1))
-        rate = [100 * w / n for w, n in zip(won, of, strict=True)]
-        ends = [wilson_of(w, n) for w, n in zip(won, of, strict=True)]
-        error = [[max(r - 100 * low, 0) for r, (low, _) in zip(rate, ends, strict=True)],
-                 [max(100 * high - r, 0) for r, (_, high) in zip(rate, ends, strict=True)]]  # fmt: skip
+        rate, low, high = np.array([rate_of(points[at], "success") for at in x]).T
+        error = np.maximum([rate - low, high - rate], 0.0)
         ax.errorbar(x, rate, yerr=error, marker="o", capsize=3, label=name)
     ax.set(xlabel=label, ylabel="success [%]", ylim=(0, 102))
     ax.grid(alpha=0.3)
