@@ -3,9 +3,9 @@
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
 With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories, what lifts them (``cpu``, and
-``cpu-ct`` before its fine-tuning), the latter when it sees its own past actions (``cpu-ct-actions``), the former
-trained with noise (``noise``) or in rooms of many densities (``dense``), and planner and explorer beside them. The
-lifted ones of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion of 0 to 2
+``cpu-ct`` before its fine-tuning), the latter when it sees its own past actions (``cpu-ct-actions``), both trained
+with noise (``noise``, ``noise-ct``) or in rooms of many densities (``dense``), and planner and explorer beside them.
+The lifted ones of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion of 0 to 2
 times a real robot's errors, and the paper's seven pairs in one fixed room.
 Everything finished is kept: the same command goes on.
 Writes ``experiments/results/turtlebot3-PRESET.json``, in which rows of other seeds and variants stay, and the plots
@@ -25,7 +25,9 @@ DENSITIES = (0.5, 1.5, 2.0)  # besides 1, in which every variant is measured
 LEVELS = (0.5, 1.0, 2.0)  # besides 0
 SEVEN_LEVELS = (0.0, 1.0)
 SWEEPS = ("density", "noise", "seven")
-SWEPT = {"cpu-ct": SWEEPS, "cpu": SWEEPS, "noise": ("noise", "seven"), "dense": ("density",)}  # what variants meet
+SWEPT = {  # what variants meet
+    "cpu-ct": SWEEPS, "cpu": SWEEPS, "noise-ct": ("noise", "seven"), "noise": ("noise", "seven"), "dense": ("density",),
+}  # fmt: skip
 SWEPT_PAIRS = 10  # in each room of those
 
 
@@ -38,7 +40,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu-ct-actions, cpu, noise, dense. By default all."""
+    """Rows to run: ct, bc-ct, f-ct, cpu-ct, cpu-ct-actions, cpu, noise-ct, noise, dense. By default all."""
     sweeps: bool = True
     """Also other densities, levels of noise, and the seven pairs."""
     out: Path = Path("runs/turtlebot3")
@@ -67,6 +69,7 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
             "cpu-ct": replace(lifted, rounds=0),
             "cpu-ct-actions": replace(lifted, rounds=0, model=replace(lifted.model, actions=True)),
             "cpu": lifted,
+            "noise-ct": replace(lifted, rounds=0, rooms=replace(lifted.rooms, noise=1.0)),
             "noise": replace(lifted, rooms=replace(lifted.rooms, noise=1.0)),
             "dense": replace(lifted, rooms=replace(lifted.rooms, density=min(DENSITIES), densest=max(DENSITIES))),
         }

@@ -183,7 +183,7 @@ def test_models_that_differ_are_less_certain_than_episodes_are_many():
 
 def test_the_turtlebots_rows_share_what_they_can():
     known = variants_for("cpu")
-    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu-ct-actions", "cpu", "noise", "dense"]
+    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu-ct-actions", "cpu", "noise-ct", "noise", "dense"]
     lifted, seeing = known["cpu-ct"], known["cpu-ct-actions"]
     assert replace(known["cpu"], rounds=0) == lifted
     assert replace(seeing, model=lifted.model) == lifted and seeing.model.actions and not lifted.model.actions
