@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 
 from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
-from ct_jax import devices
+from ct_jax import devices, interrupts
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.collect import CollectConfig, collect
 from ct_jax.evaluate import Pairs, evaluate
@@ -31,6 +31,7 @@ from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork
 
 FOLDER, NAME = Path(sys.argv[1]), sys.argv[2]
+interrupts.GRACE_S = 120.0  # on a busy machine, to stop by itself takes longer than the system would wait
 signals = contextlib.ExitStack()
 signals.enter_context(interruptible())  # before the processes meet, as the command line does
 if among := sys.argv[3:]:  # before anything asks JAX for its devices
