@@ -36,7 +36,7 @@ def state(seed: int = 0) -> State:
     return State(weights, key, jax.random.split(key, 3), jnp.asarray(seed, jnp.int32))
 
 
-def same(a, b) -> None:
+def assert_same(a, b) -> None:
     def plain(leaf):
         return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
 
@@ -57,7 +57,7 @@ def test_a_state_comes_back_with_its_keys(tmp_path):
     again = Checkpoints(tmp_path / "states")
     step, found = again.restore(state())
     assert step == 7
-    same(found, state(3))
+    assert_same(found, state(3))
     np.testing.assert_array_equal(jax.random.uniform(found.key, (3,)), jax.random.uniform(state(3).key, (3,)))
     again.close()
 
@@ -70,7 +70,7 @@ def test_the_newest_comes_back_and_few_are_kept(tmp_path):
     step, found = kept.restore(state())
     kept.close()
     assert step == 5
-    same(found, state(5))
+    assert_same(found, state(5))
     assert sorted(int(p.name) for p in (tmp_path / "states").iterdir() if p.name.isdigit()) == [2, 5]
 
 
@@ -203,8 +203,8 @@ def test_weights_come_back_as_they_were(tmp_path):
     """Also in a structure of shapes only, transposed in memory, and single numbers."""
     turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6).reshape(2, 3).T}
     save_weights(tmp_path / "w.safetensors", turned)
-    same(load_weights(tmp_path / "w.safetensors", turned), turned)
-    same(load_weights(tmp_path / "w.safetensors", jax.eval_shape(lambda: turned)), turned)
+    assert_same(load_weights(tmp_path / "w.safetensors", turned), turned)
+    assert_same(load_weights(tmp_path / "w.safetensors", jax.eval_shape(lambda: turned)), turned)
 
 
 def test_other_weights_are_refused_with_both_shapes(tmp_path):
@@ -279,7 +279,7 @@ def test_json_errors_name_the_file_and_the_line(tmp_path):
 def test_without_compilation(tmp_path, jit_disabled):
     kept = Checkpoints(tmp_path / "states")
     kept.save(1, state(1))
-    same(kept.restore(state())[1], state(1))
+    assert_same(kept.restore(state())[1], state(1))
     kept.close()
     save_weights(tmp_path / "w.safetensors", TREE)
-    same(load_weights(tmp_path / "w.safetensors", TREE), TREE)
+    assert_same(load_weights(tmp_path / "w.safetensors", TREE), TREE)

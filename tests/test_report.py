@@ -8,6 +8,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from ct_envs import UserError
@@ -126,9 +127,14 @@ def read(run) -> tuple[str, Page]:
     assert html == run / "report.html"
     assert (run / "report.png").read_bytes().startswith(b"\x89PNG")
     text = html.read_text("utf-8")
+    return text, assert_whole(text)
+
+
+def assert_whole(text: str) -> Page:
+    """A page whose tags nest, and all of which are closed."""
     page = Page(text)
     assert page.nested and not page.open
-    return text, page
+    return page
 
 
 # ---------------------------------------------------------------------------------------------- a whole run
@@ -238,7 +244,7 @@ def test_any_part_may_be_missing_or_torn(make_run, part, kept):
     (run / part).unlink()
     if kept is not None:
         (run / part).write_bytes(whole[: int(kept * len(whole))])
-    Page(to_html(reading.read_run(run)))
+    assert_whole(to_html(reading.read_run(run)))
 
 
 def test_a_run_that_has_only_begun_says_what_is_missing(make_run):
@@ -270,7 +276,7 @@ def test_a_torn_line_of_metrics_is_left_out(make_run):
 def test_results_of_another_shape_are_no_results(make_run, value):
     run = make_run()
     (run / "evaluate" / "results.json").write_text(json.dumps(value))
-    to_html(reading.read_run(run))
+    assert_whole(to_html(reading.read_run(run)))
 
 
 @pytest.mark.parametrize("value", [None, [], 3, "text", {"a": None}, {"a": "not a maze"}])
@@ -278,7 +284,7 @@ def test_a_config_of_another_shape_is_shown_as_far_as_it_goes(make_run, value):
     run = strip(make_run())
     for key in ("mazes", "eval_mazes", "settings", "versions", "command", "created", "robot", "cell_m"):
         (run / "config.json").write_text(json.dumps({key: value}))
-        to_html(reading.read_run(run))
+        assert_whole(to_html(reading.read_run(run)))
     (run / "config.json").write_text(json.dumps(dict.fromkeys(("robot", "seed", "command", "mazes"), value)))
     read(run)
 
@@ -359,7 +365,9 @@ def test_paths_of_any_length_can_be_drawn(n, steps):
     path = np.zeros((30, n, 2), np.float32)
     draw_maze(ax, load_walls(SEEN))
     draw_paths(ax, path, np.arange(n) % 2 == 0, np.full(n, steps), path[0], path[0] + 1)
-    pictures.to_svg(figure, "paths")
+    assert "<path" in pictures.to_svg(figure, "paths")
+    marked = [len(points.get_offsets()) for points in ax.collections if isinstance(points, PathCollection)]
+    assert marked == [n, n, n // 2][: 2 + (n > 1)]  # starts, goals and the ends of failures, however short the ways
 
 
 def test_resampling_keeps_the_way_and_its_ends():

@@ -35,7 +35,7 @@ def fields(data):
     return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
 
-def same(a, b) -> None:
+def assert_same(a, b) -> None:
     for name, leaf in fields(a).items():
         np.testing.assert_array_equal(leaf, getattr(b, name), err_msg=name)
         assert leaf.dtype == np.asarray(getattr(b, name)).dtype, name
@@ -141,7 +141,7 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
     shift = np.asarray(shifted.timestep - plain.timestep)
     assert (shift == shift[:, :1]).all()
     assert set(shift[:, 0]) == set(range(10))
-    same(shifted.replace(timestep=plain.timestep), plain)
+    assert_same(shifted.replace(timestep=plain.timestep), plain)
 
 
 # ------------------------------------------------------------------------------------------------- symmetries
@@ -202,7 +202,7 @@ def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry)
     window = draw(jax.random.key(0), data, data.rtg, mazes, **options)
     other = draw(jax.random.key(0), turned, turned.rtg, turned_mazes, **options)
     assert window.map[:, :, 1].any() and window.map[:, :, 0].any()
-    same(mirror_windows(jnp.full(16, element(symmetry)), GROUP, window), other)
+    assert_same(mirror_windows(jnp.full(16, element(symmetry)), GROUP, window), other)
 
 
 def test_mirroring_draws_all_symmetries(toy_data):
@@ -223,7 +223,7 @@ def test_mirroring_draws_all_symmetries(toy_data):
 def test_saving_and_loading_is_the_identity(toy_data, tmp_path):
     data = toy_data(LENGTHS, mazes=3)
     save(data, tmp_path / "data.npz")
-    same(load(tmp_path / "data.npz"), data)
+    assert_same(load(tmp_path / "data.npz"), data)
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "text", "half", "one byte", "other arrays", "pickle"])
@@ -265,8 +265,8 @@ def test_joining_keeps_everything(toy_data, steps):
 
 def test_selecting_takes_integers_and_bools(toy_data):
     data = toy_data(LENGTHS)
-    same(select(data, np.array([2, 0])), concatenate_exact(data, [2, 0]))
-    same(select(data, np.array([True, False, True])), concatenate_exact(data, [0, 2]))
+    assert_same(select(data, np.array([2, 0])), concatenate_exact(data, [2, 0]))
+    assert_same(select(data, np.array([True, False, True])), concatenate_exact(data, [0, 2]))
 
 
 def concatenate_exact(data: Trajectories, index: list[int]) -> Trajectories:
@@ -321,10 +321,10 @@ def test_kept_maps_and_goals_come_back_and_need_no_maze(kept):
 def test_kept_maps_survive_saving_padding_and_joining(kept, tmp_path):
     data, _ = kept(LENGTHS)
     save(data, tmp_path / "data.npz")
-    same(data, load(tmp_path / "data.npz"))
-    same(select(pad(data, 5, 64), np.arange(3)), concatenate([data]))
+    assert_same(data, load(tmp_path / "data.npz"))
+    assert_same(select(pad(data, 5, 64), np.arange(3)), concatenate([data]))
     joined = concatenate([select(data, np.array([0])), select(data, np.array([1, 2]))])
-    same(joined, concatenate([data]))
+    assert_same(joined, concatenate([data]))
 
 
 def test_the_turtlebot_mirrored_sees_left_and_right_change_places(kept):
@@ -337,4 +337,4 @@ def test_the_turtlebot_mirrored_sees_left_and_right_change_places(kept):
     np.testing.assert_array_equal(mirrored.map, window.map[..., ::-1, :])
     for name in ("proprio", "goal", "action", "target"):
         np.testing.assert_array_equal(getattr(mirrored, name), np.asarray(getattr(window, name)) * np.float32([1, -1]))
-    same(mirror_windows(jnp.ones(8, jnp.int32), group, mirrored), window)
+    assert_same(mirror_windows(jnp.ones(8, jnp.int32), group, mirrored), window)
