@@ -159,7 +159,6 @@ def run_plan(
     seen, unseen = default_mazes(robot)
     rows: list[dict[str, Any]] = []
     before: list[Run] = []
-    margins: set[float | None] = set()
     for seed in seeds:
         for place, (name, settings) in enumerate(plan.variants.items()):
             run = Run(
@@ -173,11 +172,10 @@ def run_plan(
             found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
             if place == 0 and plan.baselines is not None:
                 found += run_baselines(run, plan.baselines)
-            if margin(run) in margins:
+            if margin(run) in map(margin, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
-            margins.add(margin(run))
             keep(rows)
     return rows
 
@@ -243,6 +241,25 @@ def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, dict[str, str]]:
     return {"outcomes": {name: "".join("01"[int(flag)] for flag in flags[name]) for name in flags}}
 
 
+def claim(file: Path, of: dict[str, Any], what: str) -> dict[str, Any]:
+    """Say in a file of a folder what its results are of; returns the ``origin`` of whoever said so first.
+
+    Args:
+        what: the word for what they are of.
+
+    Raises:
+        UserError: they are of something else.
+    """
+    of = json.loads(json.dumps(of, default=str))  # tuples as lists, as they are read back
+    if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(file, {"of": of} | origin(provenance()))
+    before = read_json(file)
+    if before.get("of") != of:
+        raise UserError(f"{file.parent}: was made with other {what}; delete it, and it is made anew")
+    return origin(before)
+
+
 # ------------------------------------------------------------------------------------------------------- baselines
 
 
@@ -275,7 +292,7 @@ def _baseline(
     actor = Actor(env.action_size, width, frame)
     params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
     policy = ActorPolicy(params, env.action_size, width, frame)
-    made = _made(folder / "baseline.json", config)
+    made = claim(folder / "baseline.json", asdict(config), "settings")
     file = folder / "weights.safetensors"
     if not file.is_file():
         metrics = Metrics(folder)
@@ -290,17 +307,6 @@ def _baseline(
     return [made | row | outcomes(folder, row) for row in rows]
 
 
-def _made(file: Path, config: CqlConfig | SacConfig) -> dict[str, Any]:
-    """What made a baseline, written down when its training begins. Raises UserError if that had other settings."""
-    settings = json.loads(json.dumps(asdict(config)))  # tuples as lists, as they are read back
-    if not file.is_file():
-        write_json(file, {"settings": settings} | origin(provenance()))
-    before = read_json(file)
-    if before["settings"] != settings:
-        raise UserError(f"{file.parent}: was made with other settings; delete it, and it is learned anew")
-    return origin(before)
-
-
 # --------------------------------------------------------------------------------------------------------- results
 
 
@@ -310,7 +316,8 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
 
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
-        return (*model, *(row.get(name) for name in ("method", "maze", "margin_m", "density", "noise")))
+        where = (row.get(name) for name in ("method", "maze", "density", "noise"))
+        return (*model, *where, row.get("margin_m") or 0.0)  # rows of earlier commits name none, and had none
 
     kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
     now = {row["variant"]: row.get("settings") for rows in found.values() for row in rows}

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
-from _variants import origin
+from _variants import claim, origin
 from matplotlib.figure import Figure
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
@@ -123,19 +123,11 @@ def measure(options: Options) -> list[dict[str, Any]]:
             for start in ("scratch", "transfer"):
                 source = make(other).model if start == "transfer" else None
                 folder = options.out / robot / f"{start}-{seed}"
-                _claim(folder, {"robot": runs[robot], "other": runs[other], "episodes": options.episodes})
+                of = {"robot": runs[robot], "other": runs[other], "episodes": options.episodes}
+                claim(folder / "curve.json", of, "runs or pairs")
                 head = {"robot": robot, "start": other if source else "scratch", "seed": seed}
                 rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
     return rows
-
-
-def _claim(folder: Path, of: dict[str, Any]) -> None:
-    """Make a curve's folder, or take it. Raises UserError if the curve in it is of something else."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file, mine = folder / "curve.json", {key: str(value) for key, value in of.items()}
-    if file.is_file() and read_json(file) != mine:
-        raise UserError(f"{folder}: holds a curve of other runs or pairs; delete it, or choose another with --out")
-    write_json(file, mine)
 
 
 def draw(rows: list[dict[str, Any]], file: Path) -> None:

@@ -134,6 +134,10 @@ def test_rows_of_other_sittings_stay_in_the_results(tmp_path):
         ("ct", 1, "ct", 0.2), ("bc", 0, "ct", 0.3), ("bc", 0, "planner", 0.8), ("ct", 0, "ct", 0.4),
     ]  # fmt: skip
     assert found["noise"] == [row("ct", 0, 0.3)]
+    anew = row("bc", 0, 0.7, "planner") | {"margin_m": 0.0}  # earlier rows do not name the margin that they had not
+    wary = row("cpu", 0, 0.9, "planner") | {"margin_m": 0.3}
+    write_results(file, {"rows": [anew, wary]})
+    assert [r for r in read_json(file)["rows"] if r["method"] == "planner"] == [anew, wary]
 
 
 def test_rows_of_other_settings_do_not_stay_under_the_same_name(tmp_path):

@@ -72,10 +72,10 @@ def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path)
         assert experiment.curve(target, None, 0, replace(options, marks=marks), folder) == rows
         ends.append({key: value for key, value in rows[-1].items() if key not in ("wall_s", "created")})
     assert ends[0] == ends[1]
-    experiment._claim(tmp_path / "a", {"episodes": 4})
-    experiment._claim(tmp_path / "a", {"episodes": 4})
+    claimed = experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 4, "point": tmp_path}, "runs or pairs")
+    assert experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 4, "point": tmp_path}, "") == claimed
     with pytest.raises(UserError, match="other runs or pairs"):
-        experiment._claim(tmp_path / "a", {"episodes": 5})
+        experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 5, "point": tmp_path}, "runs or pairs")
     both = [{"robot": robot, "start": "scratch"} | row for robot in ("ant", "point") for row in rows]
     experiment.draw(both, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 0

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 from ct_envs import UserError
 from ct_envs.lidar import LIDAR_RANGE_M
 from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, lidar_map
+from ct_envs.robots import ROBOTS
 from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_noise import Belief, Noise
 from ct_envs.turtlebot3_pool import _EMPTY, Episode, Frame, Turtlebot3Pool
@@ -554,6 +556,25 @@ def test_an_interrupted_step_is_done_again(pool, played, monkeypatch):
 
 
 @bullet
+def test_an_error_in_what_is_driven_again_leaves_nothing_behind(played, tmp_path):
+    """A worker dies, and its successor lacks its URDF: an error; once the file is back, all goes on where it was."""
+    ours = resources.files("ct_envs") / "assets" / ROBOTS["turtlebot3"].xml
+    file, away = tmp_path / "robot.urdf", tmp_path / "away"
+    file.write_bytes(ours.read_bytes())
+    with Turtlebot3Pool(3, processes=1, config=Turtlebot3Config(urdf=str(file))) as fragile:
+
+        def lose(i):
+            if i == 5:
+                os.kill(fragile.pids[0], signal.SIGKILL)
+                file.rename(away)
+                with pytest.raises(UserError, match="no URDF file"):
+                    fragile.step(script()[5])
+                away.rename(file)
+
+        assert_equal_frames(played, play(fragile, script(), lose))
+
+
+@bullet
 def test_a_process_that_always_dies_is_one_line(pool, monkeypatch):
     pool.reset(tasks())
     monkeypatch.setattr("multiprocessing.connection.Connection.recv", _raise_eof)
@@ -593,8 +614,7 @@ INTERRUPTED = """
 import signal
 
 import numpy as np
-from ct_envs.turtlebot3_noise import Belief, Noise
-from ct_envs.turtlebot3_pool import _EMPTY, Episode, Frame, Turtlebot3Pool
+from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
 from ct_envs.turtlebot3_world import make_world
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born deaf to it

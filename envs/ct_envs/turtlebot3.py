@@ -145,9 +145,10 @@ class Turtlebot3Env:
     Action: [-1, 1]^2, shares of 0.22 m/s and 2.84 rad/s. Observation: see ``observe``. An episode ends with success
     (within the goal tolerance) or, as truncation, at the horizon; a collision does not end it. ``info`` holds
     ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``,
-    ``ranges`` and ``believed``. With ``noise``, observations, ``ranges`` and the pose ``believed`` are what the robot
-    has, all else is the truth, and an episode ends where the robot believes to have arrived: with success, if it has.
-    The same world, start, goal, seed and actions give the same episode, bit for bit, whatever was simulated before.
+    ``ranges``, the pose ``believed`` and ``believed_reward``, which feels no touch. With ``noise``, observations and
+    these three are what the robot has, all else is the truth, and an episode ends where the robot believes to have
+    arrived: with success, if it has. The same world, start, goal, seed and actions give the same episode, bit for bit,
+    whatever was simulated before.
     """
 
     def __init__(self, config: Turtlebot3Config = Turtlebot3Config()):
@@ -206,14 +207,14 @@ class Turtlebot3Env:
         obs, self._sight = self._see()
         distance = float(np.linalg.norm(self._goal - pose.position))
         collision = touch.frontal or touch.grazing
-        close = distance < self.config.goal_tolerance_m
-        stopped = float(np.linalg.norm(obs["goal"])) < _STOP_M if self.config.noise else close
+        close, believed = distance < self.config.goal_tolerance_m, float(np.linalg.norm(obs["goal"]))
+        stopped = believed < _STOP_M if self.config.noise else close
         success, truncation = stopped and close, not stopped and self._steps >= self.config.horizon
         self._done = stopped or truncation
         info = {
             "success": success, "collision": collision, "frontal": touch.frontal, "grazing": touch.grazing,
             "truncation": truncation, "episode_steps": self._steps, "position": pose.position,
-            "yaw_rad": pose.yaw_rad, **self._sight,
+            "yaw_rad": pose.yaw_rad, "believed_reward": -believed, **self._sight,
         }  # fmt: skip
         return Step(obs, -distance - self.config.collision_penalty * collision, self._done, info)
 

@@ -154,7 +154,7 @@ class Turtlebot3Pool:
         """The frames of the slots asked for, from the workers that have them."""
         if not self._workers:
             raise UserError("the Turtlebot3 pool is closed; make a new one")
-        if self._asking:  # an interrupt left answers in the pipes
+        if self._asking:  # an interrupt or an error left answers in the pipes
             for number in range(len(self._workers)):
                 self._replace(number)
         self._asking = True
@@ -164,11 +164,10 @@ class Turtlebot3Pool:
         for number, request in requests.items():
             self._workers[number].send(command, request)
         answers = [self._answer(number, command, request) for number, request in requests.items()]
-        # A crash, or an error in what was driven again, leaves an answer in the pipes.
-        self._asking = any(kind not in ("frames", "error") for kind, _ in answers)
+        self._asking = any(kind != "frames" for kind, _ in answers)  # if of what was driven again, one more is to come
         for kind, answer in answers:
             if kind != "frames":
-                raise (RuntimeError if kind == "crash" else UserError)(answer)
+                raise (UserError if kind == "error" else RuntimeError)(answer)
         return {slot: frame for _, answer in answers for slot, frame in answer.items()}
 
     def _answer(self, number: int, command: str, request: dict[int, Any]) -> tuple[str, Any]:
@@ -241,7 +240,7 @@ def _work(connection: Connection, config: Turtlebot3Config) -> None:
         try:
             answer = "frames", _COMMANDS[command](envs, config, content)
         except UserError as error:
-            answer = "replay error" if command == "replay" else "error", str(error)
+            answer = "error", str(error)
         except Exception:
             answer = "crash", traceback.format_exc()
         try:
@@ -258,16 +257,12 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
             envs[slot] = Turtlebot3Env(config)
         env = envs[slot]
         obs = env.reset(episode.world, episode.start, episode.goal, seed=episode.seed, yaw_rad=episode.yaw_rad)
-        frames[slot] = _frame(obs, 0.0, 0.0, False, env.sight())
+        frames[slot] = _frame(obs, 0.0, False, env.sight())
     return frames
 
 
 def _step(envs: dict[int, Turtlebot3Env], _: Turtlebot3Config, actions: dict[int, np.ndarray]) -> dict[int, Frame]:
-    steps = {slot: envs[slot].step(action) for slot, action in actions.items()}
-    return {
-        slot: _frame(step.obs, step.reward, -float(np.linalg.norm(step.obs["goal"])), step.done, step.info)
-        for slot, step in steps.items()
-    }
+    return {slot: _frame(*envs[slot].step(action)) for slot, action in actions.items()}
 
 
 def _replay(
@@ -283,13 +278,11 @@ def _replay(
 _COMMANDS = {"reset": _reset, "step": _step, "replay": _replay}
 
 
-def _frame(
-    obs: dict[str, np.ndarray], reward: float, believed_reward: float, done: bool, info: dict[str, Any]
-) -> Frame:  # fmt: skip
+def _frame(obs: dict[str, np.ndarray], reward: float, done: bool, info: dict[str, Any]) -> Frame:
     flags = [np.asarray(info.get(name, False)) for name in ("success", "collision", "frontal", "grazing")]
     return Frame(
         obs["map"], obs["proprio"], obs["goal"], info["position"], np.asarray(info["yaw_rad"]),
         info["believed"].position, np.asarray(info["believed"].yaw_rad),
-        info["ranges"].astype(np.float32), np.float32(reward), np.float32(believed_reward), np.asarray(done),
-        *flags,
+        info["ranges"].astype(np.float32), np.float32(reward), np.float32(info.get("believed_reward", 0.0)),
+        np.asarray(done), *flags,
     )  # fmt: skip
