@@ -62,14 +62,15 @@ def variants_for(preset: str, chosen: tuple[str, ...] = ()) -> dict[str, Any]:
     if preset == "cpu":
         published = get_preset("published", "turtlebot3")
         ct = replace(published, rounds=0)
+        lifted_ct = replace(lifted, rounds=0, optimism=0.5, fit=replace(lifted.fit, shift_timestep=300))
         known = {
             "ct": ct,
             "bc-ct": replace(ct, model=replace(ct.model, returns=False)),
             "f-ct": published,
-            "cpu-ct": replace(lifted, rounds=0),
-            "cpu-ct-actions": replace(lifted, rounds=0, model=replace(lifted.model, actions=True)),
+            "cpu-ct": lifted_ct,
+            "cpu-ct-actions": replace(lifted_ct, model=replace(lifted.model, actions=True)),
             "cpu": lifted,
-            "noise-ct": replace(lifted, rounds=0, rooms=replace(lifted.rooms, noise=1.0)),
+            "noise-ct": replace(lifted_ct, rooms=replace(lifted.rooms, noise=1.0)),
             "noise": replace(lifted, rooms=replace(lifted.rooms, noise=1.0)),
             "dense": replace(lifted, rooms=replace(lifted.rooms, density=min(DENSITIES), densest=max(DENSITIES))),
         }
