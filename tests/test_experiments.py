@@ -187,9 +187,12 @@ def test_models_that_differ_are_less_certain_than_episodes_are_many():
 
 def test_the_turtlebots_rows_share_what_they_can():
     known = variants_for("cpu")
-    assert list(known) == ["ct", "bc-ct", "f-ct", "cpu-ct", "cpu-ct-actions", "cpu", "noise-ct", "noise", "dense"]
+    assert list(known)[:4] == ["ct", "bc-ct", "f-ct", "cpu-ct"]
+    assert list(known)[4:] == ["cpu-ct-v", "cpu-ct-actions", "cpu", "noise-ct", "noise", "dense"]
     lifted, seeing = known["cpu-ct"], known["cpu-ct-actions"]
-    assert replace(known["cpu"], rounds=0) == lifted
+    assert known["cpu-ct-v"] == replace(lifted, optimism=1.0)
+    asked = replace(known["cpu"], rounds=0, optimism=lifted.optimism)
+    assert replace(asked, fit=replace(asked.fit, shift_timestep=300)) == lifted and lifted.optimism < 1.0
     assert replace(seeing, model=lifted.model) == lifted and seeing.model.actions and not lifted.model.actions
     densities = [known[name].rooms.densities for name in ("cpu", "dense")]  # pyright: ignore
     assert densities == [(1.0, 1.0), (0.5, 2.0)]
