@@ -99,6 +99,7 @@ class Evaluate:
       ct-jax evaluate runs/demo --method explorer --json > explorer.json
       ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
       ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
+      ct-jax evaluate zoo:point --seed 7 --optimism 0.75
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
@@ -119,6 +120,9 @@ class Evaluate:
     """Seed of the pairs; the same pairs for every method."""
     method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
     """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
+    optimism: Annotated[float | None, arg(metavar="K", help_behavior_hint="(default: the model's)")] = None
+    """The transformer asks for K times the return that the value network predicts; returns are negative, so less than 1
+    asks to be quicker."""
     engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
@@ -354,7 +358,7 @@ def _evaluate(command: Evaluate) -> None:
         from ct_jax import pipeline
         from ct_jax.devices import is_first
 
-        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "picture")
+        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "optimism", "picture")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
     if not is_first():

@@ -34,6 +34,7 @@ from ct_jax.transformer import ControlTransformer
 from ct_jax.value import ValueNetwork
 
 MAX_SEED = 2**32 - 1
+MAX_OPTIMISM = 10.0
 Progress = Callable[[int, int], None]
 
 
@@ -236,10 +237,13 @@ def results(folder: Path) -> list[dict[str, Any]]:
     return read_json(folder / "evaluate" / "results.json")["rows"]
 
 
-def evaluate_model(run: str, *, method: str, seed: int, **options: Any) -> dict[str, Any]:
+def evaluate_model(
+    run: str, *, method: str, seed: int, optimism: float | None = None, **options: Any
+) -> dict[str, Any]:  # fmt: skip
     """Evaluate one method of a run folder or zoo model; returns its row of the table.
 
     Args:
+        optimism: k, in place of the model's own.
         options: of ``evaluate_in_maze`` or ``evaluate_in_rooms``, whichever the robot is for.
 
     Raises:
@@ -257,7 +261,18 @@ def evaluate_model(run: str, *, method: str, seed: int, **options: Any) -> dict[
     for name in options:
         if name not in known:
             raise UserError(f"--{name} is not for the {model.robot}; its options: --{', --'.join(known)}")
-    return evaluation(model, method, seed, **options)
+    if optimism is None:
+        return evaluation(model, method, seed, **options)
+    return evaluation(_asking(model, method, optimism), method, seed, **options) | {"optimism": optimism}
+
+
+def _asking(model: TrainedModel, method: str, optimism: float) -> TrainedModel:
+    """The model asking for k times the predicted return. Raises UserError for a k that means nothing."""
+    if not 0.0 < optimism <= MAX_OPTIMISM:
+        raise UserError(f"--optimism {optimism}: give a factor above 0, at most {MAX_OPTIMISM:g}")
+    if method != "ct" or not model.settings.model.returns:
+        raise UserError("--optimism is for a transformer that asks for a return (--method ct); leave it out")
+    return replace(model, policy=model.policy.replace(optimism=optimism))
 
 
 def _check_processes(robot: Robot) -> None:

@@ -1,6 +1,7 @@
 """The command line as other tools rely on it: what it takes, what it prints, and one line for bad input."""
 
 import errno
+import functools
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ import pytest
 from ct_envs.maze import maze_names
 from ct_jax import __version__, cli, pipeline
 from ct_jax.cli import main
+from ct_jax.presets import Settings
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -76,6 +78,25 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
         assert row[name] == pytest.approx(whole[0][name]), name
 
 
+def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
+    asked = []
+    evaluation = pipeline._EVALUATIONS["maze"]
+
+    @functools.wraps(evaluation)
+    def listening(model, *args, **options):
+        asked.append(model.policy.optimism)
+        return evaluation(model, *args, **options)
+
+    monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listening)
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
+    rows = []
+    for more in ([], ["--optimism", "0.5"]):
+        assert main([*command, *more]) == 0
+        rows.append(json.loads(capsys.readouterr().out))
+    assert asked == [Settings().optimism, 0.5]
+    assert "optimism" not in rows[0] and rows[1]["optimism"] == 0.5
+
+
 def test_without_pybullet_every_other_robot_works(tiny_run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
@@ -116,7 +137,10 @@ def test_version(capsys):
         ([], ["train", "evaluate", "report", "mazes", "examples:", "ct-jax train point --preset demo"]),
         (["train"], ["ROBOT", "--preset", "--out", "--seed", "--maze", "--eval-maze", "--engine", "--resume"]),
         (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
-        (["evaluate"], ["RUN", "--maze", "--episodes", "--seed", "--method", "--json", "zoo:point", "examples:"]),
+        (
+            ["evaluate"],
+            ["RUN", "--maze", "--episodes", "--seed", "--method", "--optimism", "--json", "zoo:point", "examples:"],
+        ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
     ],
@@ -173,6 +197,9 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
         (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
         (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
+        (["evaluate", "RUN", "--optimism", "0"], ["--optimism 0", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--optimism", "nan"], ["--optimism nan", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--optimism", "0.5", "--method", "explorer"], ["--optimism", "--method ct"]),
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "zoo:nobody"], ["zoo:nobody", "models: zoo:"]),
