@@ -261,9 +261,10 @@ def evaluate_model(
     for name in options:
         if name not in known:
             raise UserError(f"--{name} is not for the {model.robot}; its options: --{', --'.join(known)}")
-    if optimism is None:
-        return evaluation(model, method, seed, **options)
-    return evaluation(_asking(model, method, optimism), method, seed, **options) | {"optimism": optimism}
+    asked = {}
+    if optimism is not None:
+        model, asked = _asking(model, method, optimism), {"optimism": optimism}
+    return evaluation(model, method, seed, **options) | asked
 
 
 def _asking(model: TrainedModel, method: str, optimism: float) -> TrainedModel:

@@ -80,14 +80,13 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
 
 def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
     asked = []
-    evaluation = pipeline._EVALUATIONS["maze"]
 
-    @functools.wraps(evaluation)
-    def listening(model, *args, **options):
+    @functools.wraps(pipeline._EVALUATIONS["maze"])
+    def listen(model, *args, **options):
         asked.append(model.policy.optimism)
-        return evaluation(model, *args, **options)
+        return {"robot": model.robot}
 
-    monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listening)
+    monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     rows = []
     for more in ([], ["--optimism", "0.5"]):

@@ -130,6 +130,16 @@ def read(run) -> tuple[str, Page]:
     return text, assert_whole(text)
 
 
+def path_figures(text: str) -> list[str]:
+    """The drawings of the transformer's paths, one for each maze."""
+    return re.findall(r"<svg[^>]*Paths of Control Transformer.*?</svg>", text, re.S)
+
+
+def crosses(figure: str) -> int:
+    """How many failures a drawing marks."""
+    return sum(g.count("<use") for g in figure.split("<defs>") if "fill: var(--fail)" in g)
+
+
 def assert_whole(text: str) -> Page:
     """A page whose tags nest, and all of which are closed."""
     page = Page(text)
@@ -183,11 +193,7 @@ def test_every_failure_is_listed_and_marked(whole):
     text, page = whole
     assert len([row for row in page.rows if "stayed on one spot" in row]) == 7
     assert "2 failures: Control Transformer in antmaze-umaze" in page.text
-    for failed, figure in zip(
-        (2, 5), re.findall(r"<svg[^>]*Paths of Control Transformer.*?</svg>", text, re.S), strict=True
-    ):
-        crosses = [g for g in figure.split("<defs>") if "fill: var(--fail)" in g]
-        assert sum(g.count("<use") for g in crosses) == failed
+    assert [crosses(figure) for figure in path_figures(text)] == [2, 5]
 
 
 def test_the_verdict_says_how_it_fails(whole):
@@ -304,7 +310,9 @@ def test_broken_episodes_are_drawn_as_far_as_they_go(make_run):
     arrays["start"][0] = np.nan
     arrays["steps"][1] = 0
     write_arrays(run / "evaluate" / f"{UNSEEN}-ct.npz", **arrays)
-    read(run)
+    text, _ = read(run)
+    _, figure = path_figures(text)
+    assert crosses(figure) == 6 and "nan" not in figure
 
 
 @pytest.mark.parametrize("name", ["missing", "empty", "file", "broken", "list"])
