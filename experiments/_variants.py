@@ -53,7 +53,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, cpu, baselines (which learn from published's data). By default all."""
+    """Rows to run: published, bc, f-ct, cpu-ct, cpu, baselines (which learn from published's data). By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -99,7 +99,7 @@ def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, .
     """The rows of a robot's table, or those of them that are named.
 
     The method as published, at the size of the preset (with "cpu", that of "published"), without returns (BC-CT) and
-    fine-tuned (F-CT, Algorithm 4); the baselines; with "cpu" what lifts the method; with "demo" that alone.
+    fine-tuned (F-CT, Algorithm 4); the baselines; with "cpu" what lifts CT and F-CT; with "demo" that alone.
 
     Raises:
         UserError: a variant that the preset does not have, or baselines without their data.
@@ -134,8 +134,9 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             round_fit=replace(published.fit, updates=published.fit.updates // 2, warmup=20),
         ),
     }
-    if preset == "cpu":
-        variants[preset] = lifted
+    if preset == "cpu":  # likewise without and with fine-tuning
+        variants["cpu-ct"] = replace(lifted, rounds=0, fit=lifted.last_fit or lifted.fit)
+        variants["cpu"] = lifted
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)
     # Alone, the maze is the task: longer ways, so a longer view, and no edges to arrange.

@@ -31,12 +31,14 @@ pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 @pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
-    assert list(plan.variants) == ["published", "bc", "f-ct", "cpu"] and plan.baselines is not None
+    assert list(plan.variants) == ["published", "bc", "f-ct", "cpu-ct", "cpu"] and plan.baselines is not None
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
     assert replace(bc, model=published.model) == published and not bc.model.returns
     assert fct.rounds == 1 and fct.recover.keep == "separate" and fct.collect == published.collect
     assert not published.reprompt and published.collect.guide == "roadmap" and published.model.frame == "world"
     assert (fct.recover.stuck_steps, fct.recover.bumps) == ((120, 60) if robot == "humanoid" else (40, 20))
+    lifted_ct, lifted = (plan.variants[name] for name in ("cpu-ct", "cpu"))
+    assert lifted_ct.rounds == 0 < lifted.rounds and lifted_ct.collect == lifted.collect
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines.sac, replay=2000))  # its settings are for it
 
 

@@ -57,6 +57,8 @@ class SacConfig:
     action_cost: float = 0.0  # price of a step with all actuators at their limits
     tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
     effort: float = 1.0  # share of the actuators' range that the controller uses
+    greedy: float = 0.0  # share of the environments in which it acts without chance, as it will later: else it never
+    # meets the places where only chance moved it on
     target_rate: float = 0.005  # share of the new critic in the target critic at each update
     replay: int = 200_000  # transitions kept
     turn_ramp: tuple[float, float] | None = None  # from where to where in the training robots begin to look anywhere;
@@ -95,6 +97,7 @@ class SacState:
 
 
 FRAMES = ("world", "heading")
+TESTS = 20  # of the controller as it would be by then, on held-out edges, in the course of its training
 
 
 def controller_inputs(observation: Float[Array, "*b P+2"], frame: str) -> Float[Array, "*b I"]:
@@ -318,7 +321,11 @@ class Sac:
         observation = self._observe(state.env)
         inputs = self._see(observation, _one_maze(state))
         logits = self.networks.policy_network.apply(state.normalizer, state.policy, inputs)
-        action = self.networks.parametric_action_distribution.sample(logits, act_key)
+        distribution = self.networks.parametric_action_distribution
+        action = distribution.sample(logits, act_key)
+        if self.config.greedy:
+            without = jnp.arange(len(action)) < self.config.greedy * len(action)
+            action = jnp.where(without[:, None], distribution.mode(logits), action)
         random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
         after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
@@ -546,16 +553,23 @@ def train_controller(
     env = env_factory(maps=False, horizon=config.episode_steps, reset_velocity_mps=config.reset_velocity_mps)
     sac = Sac(env, config)
     state = alike(sac.create(train_key, maze, train_tasks))
-    state = run_to(
-        config.iterations, state, sac.train, lambda state: int(state.iteration),
-        on_progress,
-        checkpoints, chunk,
-    )  # fmt: skip
-    normalizer, average = jax.tree.map(jnp.asarray, jax.device_get((state.normalizer, state.average)))
-    act = SacController(normalizer, average, env.action_size, config.hidden, config.frame, config.effort)
     alone, in_a_row = (
         env_factory(maps=False, horizon=config.episode_steps, auto_reset=again) for again in (False, True)
     )
+
+    def learned(state: SacState) -> SacController:
+        normalizer, average = jax.tree.map(jnp.asarray, jax.device_get((state.normalizer, state.average)))
+        return SacController(normalizer, average, env.action_size, config.hidden, config.frame, config.effort)
+
+    def train(state: SacState, n: int) -> tuple[SacState, dict[str, Any]]:
+        after, metrics = sac.train(state, n)
+        before, now = (int(s.iteration) * TESTS // config.iterations for s in (state, after))
+        if now > before:
+            metrics |= {"held_out": edge_success(alone, learned(after), maze, test_tasks, test_key)}
+        return after, metrics
+
+    state = run_to(config.iterations, state, train, lambda state: int(state.iteration), on_progress, checkpoints, chunk)
+    act = learned(state)
     every_edge = chain_tasks(_tasks(roadmap, roadmap.edges), seed)
     return act, {
         "held_out_success": edge_success(alone, act, maze, test_tasks, test_key),
