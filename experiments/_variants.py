@@ -135,7 +135,8 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         ),
     }
     if preset == "cpu":  # likewise without and with fine-tuning
-        variants["cpu-ct"] = replace(lifted, rounds=0, fit=lifted.last_fit or lifted.fit)
+        assert lifted.last_fit is not None
+        variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)

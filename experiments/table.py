@@ -17,6 +17,7 @@ import numpy as np
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
+FINE_TUNED = {"F-CT": "CT", "F-CT, `cpu`": "CT, `cpu-ct`"}  # and what each was before
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
@@ -71,23 +72,21 @@ def method_name(row: dict[str, Any]) -> str:
         return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
     if method != "ct":
         return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
-    return {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"}.get(variant, f"CT, `{variant}`")
+    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT", "cpu": "F-CT, `cpu`"}
+    return named.get(variant, f"CT, `{variant}`")
 
 
 def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
-    """F-CT less CT in each maze, pair by pair and model by model."""
+    """F-CT less CT in each maze, as published and lifted, pair by pair and model by model."""
     lines = []
     for (seen, maze, name), tuned in together.items():
-        plain = together.get((seen, maze, "CT"))
-        if name == "F-CT" and plain is not None:
-            of_seed = {row["model_seed"]: flags(row, "success") for row in plain}
-            pairs = [
-                (flags(row, "success"), of_seed[row["model_seed"]]) for row in tuned if row["model_seed"] in of_seed
-            ]
-            changes = [after - before for after, before in pairs]
+        untuned = FINE_TUNED.get(name, "")
+        of_seed = {row["model_seed"]: flags(row, "success") for row in together.get((seen, maze, untuned), ())}
+        changes = [flags(row, "success") - of_seed[row["model_seed"]] for row in tuned if row["model_seed"] in of_seed]
+        if changes:
             low, high = interval_of_mean(np.stack(changes))
             mean = 100 * np.mean(changes)
-            lines += [f"{maze}: F-CT less CT {mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) of 100"]
+            lines += [f"{maze}: {name} less {untuned} {mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) of 100"]
     return ["", "; ".join(lines) + "."] if lines else []
 
 

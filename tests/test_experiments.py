@@ -12,6 +12,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Baselines, Plan, digest, plan_for, run_plan, share, write_results
+from controllers import described, minutes, table
 from table import differences, interval_of_mean, method_name, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
 
@@ -236,3 +237,12 @@ def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
     lines = transfer_table({"rows": rows})
     assert lines[2] == "| point | from scratch | 0 | 30 | 90 | 90 |"  # 51 of 60 points of the way from 50 to 100
     assert lines[3] == "| point | from the ant's trunk | 50 | 85 | 90 | 46 |"
+
+
+def test_a_shipped_controller_says_how_it_was_learned(tiny_run):
+    found = described(tiny_run.folder)
+    curve, config = found["made"]["curve"], found["sac"]
+    assert curve and curve[-1] == (config["iterations"], found["made"]["held_out_success"])
+    assert minutes(found)[-1][0] == pytest.approx(found["made"]["wall_s"] / 60)
+    (line,) = table([found])[2:]
+    assert f"| {100 * curve[-1][1]:.1f} |" in line and found["made"]["command"] in line

@@ -221,12 +221,26 @@ def test_starts_turn_away_from_their_goals_bit_by_bit(roadmap):
         np.testing.assert_allclose(eased.env.info["tasks"].turn_rad, np.full(TINY.envs, np.pi * share), rtol=1e-6)
 
 
+def test_in_a_share_of_the_environments_nothing_is_left_to_chance(roadmap):
+    greedy = make(replace(TINY, greedy=0.5, warmup=0))
+    state = greedy.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+
+    def moved(key: int) -> np.ndarray:
+        after, _ = greedy._collect(state.replace(key=jax.random.key(key)))
+        return np.asarray(after.env.obs["proprio"])  # pyright: ignore
+
+    one, other = moved(1), moved(2)
+    np.testing.assert_array_equal(one[:2], other[:2])
+    assert (one[2:] != other[2:]).any(1).all()
+
+
 def test_it_goes_on_as_if_nothing_had_happened(roadmap, tmp_path):
     """Interrupted by Ctrl-C and continued: the same controller, to the bit."""
     train = functools.partial(train_controller, jax.random.key(0), ENV, UMAZE, roadmap, TINY, chunk=4)
     seen = []
-    whole, tested = train(on_progress=lambda i, metrics: seen.append((i, metrics["critic_loss"])))
+    whole, tested = train(on_progress=lambda i, metrics: seen.append((i, metrics["held_out"])))
     assert [i for i, _ in seen] == [4, 8] and all(0 <= share <= 1 for share in tested.values())
+    assert seen[-1][1] == tested["held_out_success"]  # the curve ends where the controller is
 
     def interrupt(iteration, metrics):
         raise KeyboardInterrupt

@@ -49,7 +49,11 @@ _GLOSSARY = {
     "Time-outs": "share of episodes that did not reach the goal in time",
 }
 CURVES = {  # what is drawn of a stage: the scalar, what it is, and how it is drawn
-    "controller": (("success", "success on edges", {"rate": True}), ("reward", "reward", {})),
+    "controller": (
+        ("success", "success on edges", {"rate": True}),
+        ("held_out", "success on held-out edges, without chance", {"rate": True}),
+        ("reward", "reward", {}),
+    ),
     "value": (("loss", "loss", {"log": True}),),
     "fit": (("loss", "loss", {"log": True}),),
 }
