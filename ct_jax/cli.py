@@ -80,8 +80,9 @@ class Train:
     """Maze to train in, by name or text file. By default the paper's, antmaze-large."""
     eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
     """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
-    controller: Annotated[str, arg(metavar="own|zoo|RUN")] = "own"
-    """Low-level controller: learn one's own, take the one that ships with the package, or that of another run."""
+    controller: Annotated[str | None, arg(metavar="own|zoo|RUN")] = None
+    """Low-level controller: learn one's own (by default; the ant's demo takes zoo), take the one that ships with the
+    package, or that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     resume: FlagCreatePairsOff[bool] = False
@@ -301,13 +302,16 @@ def _train(command: Train) -> None:
     seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
     pipeline.check_seed(command.seed)
-    if command.controller != "own":
-        load_controller(command.controller, command.robot)  # before a folder is made for it
+    settings = get_preset(command.preset, command.robot)
+    if command.controller is not None:
+        settings = replace(settings, controller=command.controller)
+    if settings.controller != "own":
+        load_controller(settings.controller, command.robot)  # before a folder is made for it
     run = Run(
         folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
         robot=command.robot,
         preset=command.preset,
-        settings=replace(get_preset(command.preset, command.robot), controller=command.controller),
+        settings=settings,
         mazes=load_mazes(command.maze or seen),
         eval_mazes=load_mazes(command.eval_maze or unseen),
         seed=command.seed,
@@ -344,7 +348,7 @@ def _check_in_rooms(command: Train) -> None:
     """Raises UserError for options that mean nothing in rooms, or where PyBullet is missing."""
     from ct_envs.turtlebot3 import load_pybullet
 
-    for name, default in (("maze", ()), ("eval_maze", ()), ("controller", "own"), ("engine", "auto")):
+    for name, default in (("maze", ()), ("eval_maze", ()), ("controller", None), ("engine", "auto")):
         if getattr(command, name) != default:
             option = name.replace("_", "-")
             raise UserError(f"--{option} is not for the {command.robot}, which drives in random rooms; leave it out")

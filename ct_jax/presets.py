@@ -225,7 +225,11 @@ TURTLEBOT3_PRESETS = {
 
 _OF_ROBOT: dict[str, Callable[[], dict[str, Settings]]] = {
     "point": lambda: PRESETS,
-    "ant": lambda: {name: _for_ant(settings) for name, settings in PRESETS.items()},
+    # A gait is not learned in minutes.
+    "ant": lambda: (
+        {name: _for_ant(settings) for name, settings in PRESETS.items()}
+        | {"demo": replace(_for_ant(DEMO), controller="zoo")}
+    ),
     "humanoid": lambda: {name: _for_humanoid(settings) for name, settings in PRESETS.items()},
     "turtlebot3": lambda: TURTLEBOT3_PRESETS,
 }

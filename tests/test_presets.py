@@ -72,3 +72,8 @@ def test_configs_are_frozen():
             with pytest.raises(AttributeError):
                 setattr(config, fields(config)[0].name, None)
             assert replace(config) == config
+
+
+def test_a_gait_is_not_learned_in_a_demo():
+    assert get_preset("demo", "ant").controller == "zoo"
+    assert {get_preset(name, robot).controller for name in PRESETS for robot in ("point", "humanoid")} == {"own"}
