@@ -148,12 +148,15 @@ def draw_sweep(rows: list[dict[str, Any]], axis: str, label: str, file: Path) ->
     lines: dict[str, dict[float, list[dict[str, Any]]]] = {}
     for row in rows:
         lines.setdefault(line_of(row), {}).setdefault(row[axis], []).append(row)
-    for name, points in lines.items():
-        x = sorted(points)
+    apart = 0.008 * np.ptp([row[axis] for row in rows])  # so that no interval hides another
+    lowest = 100.0
+    for i, (name, points) in enumerate(lines.items()):
+        x = np.array(sorted(points))
         rate, low, high = np.array([rate_of(points[at], "success") for at in x]).T
         error = np.maximum([rate - low, high - rate], 0.0)
-        ax.errorbar(x, rate, yerr=error, marker="o", capsize=3, label=name)
-    ax.set(xlabel=label, ylabel="success [%]", ylim=(0, 102))
+        ax.errorbar(x + apart * (i - (len(lines) - 1) / 2), rate, yerr=error, marker="o", ms=4, capsize=2, label=name)
+        lowest = min(lowest, *low)
+    ax.set(xlabel=label, ylabel="success [%]", ylim=(max(0.0, 10 * np.floor(lowest / 10 - 0.5)), 101))
     ax.grid(alpha=0.3)
     ax.legend()
     file.parent.mkdir(exist_ok=True)
