@@ -25,6 +25,7 @@ from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
 from ct_jax.mazes import evaluated
+from ct_jax.model import load_controller
 from ct_jax.presets import Settings, get_preset, to_dict
 from ct_jax.progress import Metrics
 from ct_jax.run import (
@@ -221,8 +222,17 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
     if row["method"] in GUIDED and margin(run) is not None:
         made["margin_m"] = margin(run)
+    if margin(run) is not None:
+        made["controller"] = controller_digest(run)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     return made | origin(config) | row
+
+
+def controller_digest(run: Run) -> str:
+    """Some letters that tell the low-level controller of a run in mazes: what is compared was led by the same."""
+    where = run.settings.controller
+    controller, _ = load_controller(str(run.folder) if where == "own" else where, run.robot)
+    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(controller))).hexdigest()[:12]
 
 
 def digest(settings: Settings) -> str:

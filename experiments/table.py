@@ -77,12 +77,16 @@ def method_name(row: dict[str, Any]) -> str:
 
 
 def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
-    """F-CT less CT in each maze, as published and lifted, pair by pair and model by model."""
+    """F-CT less CT in each maze, as published and lifted, pair by pair and model by model, led by one controller."""
+
+    def same(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["model_seed"], row.get("controller")
+
     lines = []
     for (seen, maze, name), tuned in together.items():
         untuned = FINE_TUNED.get(name, "")
-        of_seed = {row["model_seed"]: flags(row, "success") for row in together.get((seen, maze, untuned), ())}
-        changes = [flags(row, "success") - of_seed[row["model_seed"]] for row in tuned if row["model_seed"] in of_seed]
+        of_seed = {same(row): flags(row, "success") for row in together.get((seen, maze, untuned), ())}
+        changes = [flags(row, "success") - of_seed[same(row)] for row in tuned if same(row) in of_seed]
         if changes:
             low, high = interval_of_mean(np.stack(changes))
             mean = 100 * np.mean(changes)

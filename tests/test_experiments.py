@@ -91,6 +91,7 @@ def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeyp
     monkeypatch.setattr("_variants.share", lambda source, run: None)
     monkeypatch.setattr("_variants.outcomes", lambda folder, row: {})
     monkeypatch.setattr("_variants.read_json", lambda file: MADE)
+    monkeypatch.setattr("_variants.controller_digest", lambda run: "abc")
     found = [{"method": method, "maze": "m"} for method in ("ct", "planner")]
     monkeypatch.setattr("_variants.pipeline.results", lambda folder: found)
     rows = run_plan("point", plan, preset="tiny", seeds=(0, 1), out=tmp_path)
@@ -167,6 +168,8 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
             "F-CT": [row("f-ct", 1, "1" * 100), row("f-ct", 0, half)]}  # fmt: skip
     (_, line) = differences({(True, "m", name): models for name, models in rows.items()})
     assert line.startswith("m: F-CT less CT +25.0 (+0.0 to +5")
+    rows["F-CT"] = [row | {"controller": "another"} for row in rows["F-CT"]]
+    assert differences({(True, "m", name): models for name, models in rows.items()}) == []
     with_itself = interval_of_mean(np.zeros((3, 100)))
     assert with_itself == (0.0, 0.0)
     low, high = interval_of_mean(np.tile([0.0, 1.0], (3, 50)))
