@@ -8,7 +8,6 @@ Writes the table between README's markers and the picture ``docs/controllers.png
 """
 
 import json
-import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +40,7 @@ def ship(run: Path) -> None:
     if not (folder / "done.json").is_file():
         raise UserError(f"{run}: has no finished controller of its own; train it, or go on with --resume")
     robot = read_json(folder / "controller.json")["robot"]
+    (ZOO / robot).mkdir(exist_ok=True)
     shutil.copy(folder / "weights.safetensors", ZOO / robot)
     write_json(ZOO / robot / "controller.json", described(run))
 
@@ -85,12 +85,10 @@ def draw(controllers: list[dict[str, Any]], file: Path) -> None:
     ax = figure.add_subplot()
     for found in controllers:
         if curve := minutes(found):
-            at, rate = zip(*curve, strict=True)
-            ax.plot(
-                at, [100 * each for each in rate], marker=".", label=f"{found['robot']}, {found['made']['hardware']}"
-            )
+            label = f"{found['robot']}, {found['made']['hardware']}"
+            ax.plot([at for at, _ in curve], [100 * rate for _, rate in curve], marker=".", label=label)
     ax.axhline(100 * ENOUGH, color="grey", lw=0.8, ls="--")
-    ax.set(xlabel="training [min]", ylabel="held-out edges walked in time [%]", ylim=(0, 101))
+    ax.set(xlabel="training [min]", ylabel="held-out edges walked in time [%]", ylim=(0, 101), xscale="log")
     ax.grid(alpha=0.3)
     ax.legend(loc="lower right")
     figure.savefig(file, dpi=150)
@@ -99,6 +97,7 @@ def draw(controllers: list[dict[str, Any]], file: Path) -> None:
 def main() -> int:
     """Run from the command line; returns the exit status."""
     import tyro
+    from table import put
 
     from ct_jax.checkpoint import read_json
     from ct_jax.cli import guarded
@@ -108,11 +107,10 @@ def main() -> int:
             ship(each)
         controllers = [read_json(file) for file in sorted(ZOO.glob("*/controller.json"))]
         readme = ROOT / "README.md"
-        marked = re.compile(r"(<!-- controllers -->\n).*?(<!-- /controllers -->)", re.DOTALL)
-        lines = "\n".join(table(controllers)) + "\n"
-        readme.write_text(marked.sub(lambda m: m[1] + lines + m[2], readme.read_text("utf-8")), "utf-8")
+        lines = table(controllers)
+        readme.write_text(put(readme.read_text("utf-8"), "controllers", lines), "utf-8")
         draw(controllers, PICTURE)
-        print(lines)
+        print("\n".join(lines))
 
     return guarded(run)
 

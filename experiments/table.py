@@ -227,6 +227,14 @@ def _table(data: Any) -> list[str]:
     return room_table(data) if "worlds" in data["rows"][0] else experiment_table(data)
 
 
+def put(text: str, name: str, lines: list[str]) -> str:
+    """The text with these lines between its markers of that name."""
+    marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+    if not marked.search(text):
+        print(f"README.md has no place for {name}", file=sys.stderr)
+    return marked.sub(lambda m: m[1] + "\n".join(lines) + "\n" + m[2], text)
+
+
 def main() -> int:
     """Rewrite README.md."""
     readme = ROOT / "README.md"
@@ -234,10 +242,7 @@ def main() -> int:
     for file in sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")]):
         data = json.loads(file.read_text("utf-8"))
         table = _table(data)
-        marked = re.compile(rf"(<!-- {file.stem} -->\n).*?(<!-- /{file.stem} -->)", re.DOTALL)
-        if not marked.search(text):
-            print(f"README.md has no place for {file.stem}", file=sys.stderr)
-        text = marked.sub(lambda m, table=table: m[1] + "\n".join(table) + "\n" + m[2], text)
+        text = put(text, file.stem, table)
     readme.write_text(text, "utf-8")
     return 0
 
