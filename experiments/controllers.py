@@ -90,7 +90,8 @@ def draw(controllers: list[dict[str, Any]], file: Path) -> None:
     ax.axhline(100 * ENOUGH, color="grey", lw=0.8, ls="--")
     ax.set(xlabel="training [min]", ylabel="held-out edges walked in time [%]", ylim=(0, 101), xscale="log")
     ax.grid(alpha=0.3)
-    ax.legend(loc="lower right")
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.legend(loc="center")
     figure.savefig(file, dpi=150)
 
 
