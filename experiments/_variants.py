@@ -1,5 +1,6 @@
 """What the experiments share: the method's variants and the baselines, on the same data and the same pairs."""
 
+import functools
 import hashlib
 import json
 import shutil
@@ -223,15 +224,16 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     if row["method"] in GUIDED and margin(run) is not None:
         made["margin_m"] = margin(run)
     if margin(run) is not None:
-        made["controller"] = controller_digest(run)
+        where = run.settings.controller
+        made["controller"] = controller_digest(str(run.folder) if where == "own" else where, run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     return made | origin(config) | row
 
 
-def controller_digest(run: Run) -> str:
-    """Some letters that tell the low-level controller of a run in mazes: what is compared was led by the same."""
-    where = run.settings.controller
-    controller, _ = load_controller(str(run.folder) if where == "own" else where, run.robot)
+@functools.cache  # all rows of a run ask
+def controller_digest(where: str, robot: str) -> str:
+    """Some letters that tell low-level controllers apart, each named as ``load_controller`` names it."""
+    controller, _ = load_controller(where, robot)
     return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(controller))).hexdigest()[:12]
 
 

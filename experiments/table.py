@@ -241,8 +241,7 @@ def main() -> int:
     text = readme.read_text("utf-8")
     for file in sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")]):
         data = json.loads(file.read_text("utf-8"))
-        table = _table(data)
-        text = put(text, file.stem, table)
+        text = put(text, file.stem, _table(data))
     readme.write_text(text, "utf-8")
     return 0
 

@@ -91,7 +91,7 @@ def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeyp
     monkeypatch.setattr("_variants.share", lambda source, run: None)
     monkeypatch.setattr("_variants.outcomes", lambda folder, row: {})
     monkeypatch.setattr("_variants.read_json", lambda file: MADE)
-    monkeypatch.setattr("_variants.controller_digest", lambda run: "abc")
+    monkeypatch.setattr("_variants.controller_digest", lambda where, robot: "abc")
     found = [{"method": method, "maze": "m"} for method in ("ct", "planner")]
     monkeypatch.setattr("_variants.pipeline.results", lambda folder: found)
     rows = run_plan("point", plan, preset="tiny", seeds=(0, 1), out=tmp_path)
