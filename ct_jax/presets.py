@@ -112,7 +112,7 @@ _ANT_SAC = SacConfig(
 
 _HUMANOID_SAC = SacConfig(
     envs=128,
-    iterations=150_000,
+    iterations=100_000,
     updates=4,
     warmup=30,
     final_rate=0.1,
@@ -124,6 +124,7 @@ _HUMANOID_SAC = SacConfig(
     speed_mps=2.0,
     action_cost=0.2,
     target_rate=0.01,
+    greedy=0.25,
     reward_scale=0.1,
     replay=500_000,
     episode_steps=400,
