@@ -92,7 +92,7 @@ def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
     if run.done(last) is not None and devices.first((folder / "model.json").is_file):
         return load_model(str(run.folder))
     controller, sac = course.controller(metrics)
-    data = _collect(run, course, controller)
+    data = planning_trajectories(run, course, controller)
     policy = _fit(run, data, metrics)
     if run.settings.rounds:
         policy = _finetune(run, course, policy, controller, data, metrics)
@@ -104,7 +104,8 @@ def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
 # -------------------------------------------------------------------------------------------- data and transformer
 
 
-def _collect(run: Run, course: Course, controller: Any) -> Trajectories:
+def planning_trajectories(run: Run, course: Course, controller: Any) -> Trajectories:
+    """Algorithm 3's, collected or read back."""
     file = run.folder / "collect" / "trajectories.npz"
     if run.done("collect") is not None:
         return _read_trajectories(run, file)

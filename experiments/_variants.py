@@ -281,21 +281,24 @@ def run_baselines(run: Run, baselines: Baselines) -> list[dict[str, Any]]:
     """Train the baselines on a finished run's trajectories and in its maze, and evaluate them on its pairs."""
     sac = baselines.sac
 
-    def learn_cql(key: jax.Array, **watch: Any) -> ActorPolicy:
-        data = storage.load(run.folder / "collect" / "trajectories.npz")
-        learner = Cql(baselines.cql, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
-        return train_cql(key, learner, data, run.stacked, **watch)
-
     def learn_sac(key: jax.Array, **watch: Any) -> ActorPolicy:
         return train_sac_alone(key, run.env, next(iter(run.mazes.values())), sac, **watch)
 
-    cql = baselines.cql
-    return _baseline(run, "pt-cql", learn_cql, cql, cql.updates, cql.width) + _baseline(
-        run, "sac", learn_sac, sac, sac.iterations, sac.hidden[0]
-    )
+    return pt_cql(run, baselines.cql) + baseline(run, "sac", learn_sac, sac, sac.iterations, sac.hidden[0])
 
 
-def _baseline(
+def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
+    """Rows of PT-CQL with these settings, learned from the run's planning trajectories."""
+
+    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
+        data = storage.load(run.folder / "collect" / "trajectories.npz")
+        learner = Cql(config, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
+        return train_cql(key, learner, data, run.stacked, **watch)
+
+    return baseline(run, name, learn, config, config.updates, config.width)
+
+
+def baseline(
     run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
 ) -> list[dict[str, Any]]:
     """Rows of one baseline, learned unless its weights are there."""
