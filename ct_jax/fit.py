@@ -42,6 +42,7 @@ class FitConfig:
     clip: float = 1.0  # norm to which gradients are clipped
     mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
     shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
+    precision: str = "float32"  # of the transformer's computations; "bfloat16" on accelerators, parameters stay float32
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,10 @@ def _fit_both(
 @functools.cache
 def _learner(model: ControlTransformer | ValueNetwork, config: FitConfig, map_cell_m: float, robot: Robot) -> Fit:
     """One learner, and so one compilation, for all rounds that train alike."""
-    loss = value_loss(model) if isinstance(model, ValueNetwork) else transformer_loss(model)
+    if isinstance(model, ValueNetwork):
+        loss = value_loss(model)
+    else:
+        loss = transformer_loss(model.clone(dtype=None if config.precision == "float32" else config.precision))
     return Fit(loss, config, map_cell_m, robot)
 
 

@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, cpu-ct, cpu, baselines (which learn from published's data). By default all."""
+    """Rows to run: published, bc, f-ct, cpu-ct, cpu, and, beside published, pt-cql and sac. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -82,19 +82,11 @@ def experiment(robot: str, about: str | None) -> int:
 
 
 @dataclass(frozen=True)
-class Baselines:
-    """The baselines' settings; they learn from the data of the first variant."""
-
-    cql: CqlConfig
-    sac: SacConfig
-
-
-@dataclass(frozen=True)
 class Plan:
     """What an experiment runs."""
 
     variants: dict[str, Settings]
-    baselines: Baselines | None = None
+    baselines: dict[str, CqlConfig | SacConfig] = field(default_factory=dict)  # by what they are called in BASELINES
 
 
 def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, ...] = ()) -> Plan:
@@ -107,16 +99,17 @@ def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, .
         UserError: a variant that the preset does not have, or baselines without their data.
     """
     plan = _whole_plan(robot, preset, controller=controller)
-    known = [*plan.variants, *(["baselines"] if plan.baselines else [])]
+    known = [*plan.variants, *plan.baselines]
     for name in variants:
         if name not in known:
             raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {', '.join(known)}")
     if not variants:
         return plan
-    if "baselines" in variants and "published" not in variants:
-        raise UserError("the baselines learn from the data of 'published': name it, too")
     chosen = {name: settings for name, settings in plan.variants.items() if name in variants}
-    return Plan(chosen, plan.baselines if "baselines" in variants else None)
+    baselines = {name: config for name, config in plan.baselines.items() if name in variants}
+    if baselines and "published" not in variants:
+        raise UserError(f"{' and '.join(baselines)} share the data of 'published': name it, too")
+    return Plan(chosen, baselines)
 
 
 def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
@@ -145,7 +138,7 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
     # Alone, the maze is the task: longer ways, so a longer view, and no edges to arrange.
     iterations = max(lifted.sac.iterations // 2, ALONE)
     sac = replace(lifted.sac, discount=0.99, iterations=iterations, reward_scale=0.1, alive_bonus=0.0, **EDGES_ONLY)
-    return Plan(variants, Baselines(cql, sac))
+    return Plan(variants, {"pt-cql": cql, "sac": sac})
 
 
 def run_plan(
@@ -174,8 +167,8 @@ def run_plan(
                 share(other, run)
             pipeline.train(run, resume=True)
             found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
-            if place == 0 and plan.baselines is not None:
-                found += run_baselines(run, plan.baselines)
+            if place == 0:  # the method as published
+                found += [row for kind, config in plan.baselines.items() for row in BASELINES[kind](run, config)]
             if margin(run) in map(margin, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
@@ -277,16 +270,6 @@ def claim(file: Path, of: dict[str, Any], what: str) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------- baselines
 
 
-def run_baselines(run: Run, baselines: Baselines) -> list[dict[str, Any]]:
-    """Train the baselines on a finished run's trajectories and in its maze, and evaluate them on its pairs."""
-    sac = baselines.sac
-
-    def learn_sac(key: jax.Array, **watch: Any) -> ActorPolicy:
-        return train_sac_alone(key, run.env, next(iter(run.mazes.values())), sac, **watch)
-
-    return pt_cql(run, baselines.cql) + baseline(run, "sac", learn_sac, sac, sac.iterations, sac.hidden[0])
-
-
 def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
     """Rows of PT-CQL with these settings, learned from the run's planning trajectories."""
 
@@ -296,6 +279,18 @@ def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, 
         return train_cql(key, learner, data, run.stacked, **watch)
 
     return baseline(run, name, learn, config, config.updates, config.width)
+
+
+def sac_alone(run: Run, config: SacConfig) -> list[dict[str, Any]]:
+    """Rows of SAC alone in the run's maze, without its data."""
+
+    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
+        return train_sac_alone(key, run.env, next(iter(run.mazes.values())), config, **watch)
+
+    return baseline(run, "sac", learn, config, config.iterations, config.hidden[0])
+
+
+BASELINES: dict[str, Callable[[Run, Any], list[dict[str, Any]]]] = {"pt-cql": pt_cql, "sac": sac_alone}
 
 
 def baseline(

@@ -10,6 +10,7 @@ holds what was chosen.
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import tyro
 from _variants import RESULTS, plan_for, pt_cql
@@ -51,7 +52,7 @@ def main(options: Options) -> None:
     """Try everything, writing down each as it is there."""
     prepare_jax()
     plan = plan_for(options.robot, "cpu", controller=options.controller)
-    assert plan.baselines is not None
+    base: Any = plan.baselines["pt-cql"]
     settings = replace(plan.variants["published"], pairs_seed=TUNING_SEED)
     run = Run(
         folder=options.out / options.robot, robot=options.robot, preset="published", settings=settings,
@@ -67,9 +68,10 @@ def main(options: Options) -> None:
         grid = itertools.product(options.reward_scale, options.imitation, options.target_rate, options.alpha)
         for scale, imitation, rate, alpha in grid:
             tried = {"alpha": alpha, "target_rate": rate, "reward_scale": scale, "imitation": imitation}
-            config = replace(plan.baselines.cql, updates=options.updates, **tried)
-            name = "-".join(f"{name}={value:g}" for name, value in (tried | {"updates": options.updates}).items())
-            keep([tried | {"updates": options.updates, "model_seed": run.seed} | row for row in pt_cql(run, config, name)])
+            config = replace(base, updates=options.updates, **tried)
+            tried["updates"] = options.updates
+            name = "-".join(f"{name}={value:g}" for name, value in tried.items())
+            keep([tried | {"model_seed": run.seed} | row for row in pt_cql(run, config, name)])
 
 
 def keep(rows: list[dict]) -> None:

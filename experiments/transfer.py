@@ -3,8 +3,8 @@
     python experiments/transfer.py [--point runs/point/cpu-0] [--ant runs/ant/cpu-0] [--seeds 0 1 2]
 
 Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
-transformer is fitted to all trajectories of a robot's run, from scratch or from the trunk of the other robot's model
-(``ct_jax.transfer``), and tried on the run's pairs in the unseen maze as training goes on. Writes
+transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
+robot's model (``ct_jax.transfer``), and tried on the run's pairs in the unseen maze as training goes on. Writes
 ``experiments/results/transfer.json`` and ``docs/transfer.png``.
 """
 
@@ -67,10 +67,9 @@ class Target:
 
     @staticmethod
     def of(run: Path, updates: int) -> "Target":
-        """The robot of a finished run, with all its trajectories and its last fit's settings at a steady rate."""
+        """The robot of a finished run, with its planning trajectories and its last fit's settings at a steady rate."""
         model = load_model(str(run))
         settings = model.settings
-        files = [run / "collect" / "trajectories.npz", *sorted((run / "finetune").glob("trajectories-*.npz"))]
         config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
         env = MazeEnv(model.robot, map_cell_m=settings.model.map_cell_m, auto_reset=False)
         learner = Fit(transformer_loss(model.policy.model), config, settings.model.map_cell_m, env.robot)
@@ -81,7 +80,7 @@ class Target:
         )
         if not unseen:
             raise UserError(f"{run}: was evaluated in no maze but its own; train with --eval-maze")
-        data = storage.concatenate([storage.load(file) for file in files])
+        data = storage.load(run / "collect" / "trajectories.npz")
         return Target(model, data, env, learner, stack_mazes(list(seen.values())), next(iter(unseen.items())))
 
 

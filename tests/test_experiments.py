@@ -11,7 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from _variants import Baselines, Plan, digest, plan_for, run_plan, share, write_results
+from _variants import Plan, digest, plan_for, run_plan, share, write_results
 from controllers import described, minutes, table
 from table import differences, interval_of_mean, method_name, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
@@ -21,6 +21,7 @@ from ct_envs.robots import get_robot
 from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.checkpoint import read_json
+from ct_jax.controllers.sac import SacConfig
 from ct_jax.presets import get_preset
 from ct_jax.run import Run, load_mazes
 
@@ -32,36 +33,38 @@ pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 @pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
-    assert list(plan.variants) == ["published", "bc", "f-ct", "cpu-ct", "cpu"] and plan.baselines is not None
+    assert list(plan.variants) == ["published", "bc", "f-ct", "cpu-ct", "cpu"]
+    assert list(plan.baselines) == ["pt-cql", "sac"]
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
     assert replace(bc, model=published.model) == published and not bc.model.returns
     assert fct.rounds == 1 and fct.recover.keep == "separate" and fct.collect == published.collect
     assert not published.reprompt and published.collect.guide == "roadmap" and published.model.frame == "world"
-    assert (fct.recover.stuck_steps, fct.recover.bumps) == ((120, 60) if robot == "humanoid" else (40, 20))
+    stuck = {"point": (40, 20), "ant": (80, 40), "humanoid": (120, 60)}
+    assert (fct.recover.stuck_steps, fct.recover.bumps) == stuck[robot]
     lifted_ct, lifted = (plan.variants[name] for name in ("cpu-ct", "cpu"))
     assert lifted_ct.rounds == 0 < lifted.rounds and lifted_ct.collect == lifted.collect
-    SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines.sac, replay=2000))  # its settings are for it
+    SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
 
 def test_variants_can_be_chosen_and_unknown_ones_are_refused():
     assert list(plan_for("ant", "cpu", controller="zoo", variants=("cpu",)).variants) == ["cpu"]
-    assert plan_for("ant", "cpu", controller="zoo", variants=("cpu",)).baselines is None
-    assert plan_for("ant", "cpu", controller="zoo", variants=("published", "baselines")).baselines is not None
+    assert plan_for("ant", "cpu", controller="zoo", variants=("cpu",)).baselines == {}
+    assert list(plan_for("ant", "cpu", controller="zoo", variants=("published", "sac")).baselines) == ["sac"]
     with pytest.raises(UserError, match="no variant named 'gpu' with preset 'cpu'; variants: published, bc, f-ct, cpu"):
         plan_for("point", "cpu", controller="own", variants=("gpu",))
     with pytest.raises(UserError, match="name it, too"):
-        plan_for("point", "cpu", controller="own", variants=("baselines", "cpu"))
+        plan_for("point", "cpu", controller="own", variants=("pt-cql", "cpu"))
 
 
 def test_every_size_has_every_method_of_the_paper():
     paper = plan_for("ant", "paper", controller="zoo")
-    assert list(paper.variants) == ["published", "bc", "f-ct"] and paper.baselines is not None
+    assert list(paper.variants) == ["published", "bc", "f-ct"] and len(paper.baselines) == 2
     sizes = [(settings.model.width, settings.fit.updates, settings.controller) for settings in paper.variants.values()]
     assert sizes == [(512, 75_000, "zoo")] * 3
     assert list(plan_for("ant", "demo", controller="own").variants) == ["demo"]
     for robot in ("point", "ant"):
-        baselines = plan_for(robot, "cpu", controller="zoo").baselines
-        assert baselines is not None and baselines.sac.iterations >= 8 * get_robot(robot).horizon
+        sac = plan_for(robot, "cpu", controller="zoo").baselines["sac"]
+        assert isinstance(sac, SacConfig) and sac.iterations >= 8 * get_robot(robot).horizon
 
 
 def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path, monkeypatch):
@@ -70,13 +73,13 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path
     mazes = ((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],), ("antmaze-umaze",))
     monkeypatch.setattr("_variants.default_mazes", lambda robot: mazes)
     cql = CqlConfig(updates=2, batch=4, width=8, samples=1)
-    plan = Plan({"one": tiny_settings}, Baselines(cql, replace(tiny_settings.sac, iterations=4, warmup=1)))
+    plan = Plan({"one": tiny_settings}, {"pt-cql": cql, "sac": replace(tiny_settings.sac, iterations=4, warmup=1)})
     rows = run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path)
     assert [row["method"] for row in rows] == [*["ct", "planner", "explorer"] * 2, *["pt-cql"] * 2, *["sac"] * 2]
     assert all(row["episodes"] == 4 and row["seed"] == 0 and row["variant"] == "one" for row in rows)
     monkeypatch.setattr("_variants.train_cql", None)
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
-    other = Plan(plan.variants, Baselines(replace(cql, updates=3), plan.baselines.sac))  # pyright: ignore
+    other = Plan(plan.variants, plan.baselines | {"pt-cql": replace(cql, updates=3)})
     with pytest.raises(UserError, match="other settings; delete it"):
         run_plan("point", other, preset="tiny", seeds=(0,), out=tmp_path)
 
