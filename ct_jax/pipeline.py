@@ -159,20 +159,20 @@ def _fit_both(
 
     value_params = policy.value_params
     if number == 0 or last:
-        learner = _learner(value, settings.value.fit, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
+        learner = make_learner(value, settings.value.fit, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
         best = best_trajectories(data, settings.value, run.spec.goal_tolerance_m)
         value_params = train_one("value", learner, init_params(keys[0], value, data), best, keys[1])
     config = settings.fit
     if number:
         config = (settings.last_fit if last else None) or settings.round_fit or settings.fit
     params = policy.params if number else init_params(keys[2], model, data)
-    learner = _learner(model, config, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
+    learner = make_learner(model, config, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
     params = train_one("fit", learner, params, data, keys[3])
     return replace(policy, params=params, value_params=value_params)
 
 
 @functools.cache
-def _learner(model: ControlTransformer | ValueNetwork, config: FitConfig, map_cell_m: float, robot: Robot) -> Fit:
+def make_learner(model: ControlTransformer | ValueNetwork, config: FitConfig, map_cell_m: float, robot: Robot) -> Fit:
     """One learner, and so one compilation, for all rounds that train alike."""
     if isinstance(model, ValueNetwork):
         loss = value_loss(model)

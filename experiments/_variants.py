@@ -55,7 +55,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, cpu-ct, cpu, and, beside published, pt-cql and sac. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -86,7 +86,7 @@ class Plan:
     """What an experiment runs."""
 
     variants: dict[str, Settings]
-    baselines: dict[str, CqlConfig | SacConfig] = field(default_factory=dict)  # by what they are called in BASELINES
+    baselines: dict[str, CqlConfig | SacConfig] = field(default_factory=dict)  # of those variants that are in BASELINES
 
 
 def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, ...] = ()) -> Plan:
@@ -96,20 +96,16 @@ def plan_for(robot: str, preset: str, *, controller: str, variants: tuple[str, .
     fine-tuned (F-CT, Algorithm 4); the baselines; with "cpu" what lifts CT and F-CT; with "demo" that alone.
 
     Raises:
-        UserError: a variant that the preset does not have, or baselines without their data.
+        UserError: a variant that the preset does not have.
     """
     plan = _whole_plan(robot, preset, controller=controller)
-    known = [*plan.variants, *plan.baselines]
     for name in variants:
-        if name not in known:
-            raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {', '.join(known)}")
+        if name not in plan.variants:
+            known = ", ".join(plan.variants)
+            raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {known}")
     if not variants:
         return plan
-    chosen = {name: settings for name, settings in plan.variants.items() if name in variants}
-    baselines = {name: config for name, config in plan.baselines.items() if name in variants}
-    if baselines and "published" not in variants:
-        raise UserError(f"{' and '.join(baselines)} share the data of 'published': name it, too")
-    return Plan(chosen, baselines)
+    return replace(plan, variants={name: plan.variants[name] for name in plan.variants if name in variants})
 
 
 def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
@@ -129,16 +125,18 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             round_fit=replace(published.fit, updates=published.fit.updates // 2, warmup=20),
         ),
     }
-    if preset == "cpu":  # likewise without and with fine-tuning
-        assert lifted.last_fit is not None
-        variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
-        variants["cpu"] = lifted
     frame = lifted.model.frame
     cql = CqlConfig(updates=8000, mirror=True, frame=frame)
     # Alone, the maze is the task: longer ways, so a longer view, and no edges to arrange.
     iterations = max(lifted.sac.iterations // 2, ALONE)
     sac = replace(lifted.sac, discount=0.99, iterations=iterations, reward_scale=0.1, alive_bonus=0.0, **EDGES_ONLY)
-    return Plan(variants, {"pt-cql": cql, "sac": sac})
+    baselines: dict[str, CqlConfig | SacConfig] = {"pt-cql": cql, "sac": sac}
+    variants |= {name: published for name in baselines}
+    if preset == "cpu":  # likewise without and with fine-tuning
+        assert lifted.last_fit is not None
+        variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
+        variants["cpu"] = lifted
+    return Plan(variants, baselines)
 
 
 def run_plan(
@@ -157,7 +155,7 @@ def run_plan(
     rows: list[dict[str, Any]] = []
     before: list[Run] = []
     for seed in seeds:
-        for place, (name, settings) in enumerate(plan.variants.items()):
+        for name, settings in plan.variants.items():
             run = Run(
                 folder=out / f"{name}-{seed}", robot=robot, preset=preset, settings=settings,
                 mazes=load_mazes(seen), eval_mazes=load_mazes(unseen), seed=seed, engine=engine,
@@ -165,10 +163,11 @@ def run_plan(
             print(f"== {robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
             for other in before:
                 share(other, run)
-            pipeline.train(run, resume=True)
-            found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
-            if place == 0:  # the method as published
-                found += [row for kind, config in plan.baselines.items() for row in BASELINES[kind](run, config)]
+            if name in plan.baselines:
+                found = BASELINES[name](run, plan.baselines[name])
+            else:
+                pipeline.train(run, resume=True)
+                found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
             if margin(run) in map(margin, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
@@ -271,7 +270,12 @@ def claim(file: Path, of: dict[str, Any], what: str) -> dict[str, Any]:
 
 
 def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
-    """Rows of PT-CQL with these settings, learned from the run's planning trajectories."""
+    """Rows of PT-CQL with these settings, learned from the run's planning trajectories, collected if need be."""
+    with open_run(run, resume=True):
+        course, metrics = pipeline.COURSES[run.spec.course](run), Metrics(run.folder)
+        controller, _ = course.controller(metrics)
+        metrics.close()
+        pipeline.planning_trajectories(run, course, controller)
 
     def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
         data = storage.load(run.folder / "collect" / "trajectories.npz")
@@ -299,23 +303,25 @@ def baseline(
     """Rows of one baseline, learned unless its weights are there."""
     frame = config.frame
     folder = run.folder / "baselines" / name
-    folder.mkdir(parents=True, exist_ok=True)
     env = run.env(auto_reset=False)
     actor = Actor(env.action_size, width, frame)
     params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
     policy = ActorPolicy(params, env.action_size, width, frame)
-    made = claim(folder / "baseline.json", asdict(config), "settings")
     file = folder / "weights.safetensors"
-    if not file.is_file():
-        metrics = Metrics(folder)
-        with training(folder, name, total, metrics) as watch:
-            learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
-        metrics.close()
-        save_weights(file, learned.params)
-        drop_leftovers(folder)
-    policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
-    mazes = join_mazes(run.mazes, run.eval_mazes).items()
-    rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+    with open_run(run, resume=True):
+        (run.folder / "evaluate").mkdir(exist_ok=True)  # of the pairs
+        folder.mkdir(parents=True, exist_ok=True)
+        made = claim(folder / "baseline.json", asdict(config), "settings")
+        if not file.is_file():
+            metrics = Metrics(folder)
+            with training(folder, name, total, metrics) as watch:
+                learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
+            metrics.close()
+            save_weights(file, learned.params)
+            drop_leftovers(folder)
+        policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
+        mazes = join_mazes(run.mazes, run.eval_mazes).items()
+        rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
     return [made | row | outcomes(folder, row) for row in rows]
 
 

@@ -15,11 +15,9 @@ from typing import Any
 import tyro
 from _variants import RESULTS, plan_for, pt_cql
 
-from ct_jax import pipeline
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
-from ct_jax.progress import Metrics
-from ct_jax.run import Run, default_mazes, load_mazes, open_run
+from ct_jax.run import Run, default_mazes, load_mazes
 
 TUNING_SEED = 7  # of the pairs
 
@@ -58,20 +56,13 @@ def main(options: Options) -> None:
         folder=options.out / options.robot, robot=options.robot, preset="published", settings=settings,
         mazes=load_mazes(default_mazes(options.robot)[0]), eval_mazes={}, seed=options.seed, engine="auto",
     )  # fmt: skip
-    with open_run(run, resume=True):
-        course = pipeline.COURSES[run.spec.course](run)
-        metrics = Metrics(run.folder)
-        controller, _ = course.controller(metrics)
-        metrics.close()
-        pipeline.planning_trajectories(run, course, controller)
-        (run.folder / "evaluate").mkdir(exist_ok=True)  # of the pairs
-        grid = itertools.product(options.reward_scale, options.imitation, options.target_rate, options.alpha)
-        for scale, imitation, rate, alpha in grid:
-            tried = {"alpha": alpha, "target_rate": rate, "reward_scale": scale, "imitation": imitation}
-            config = replace(base, updates=options.updates, **tried)
-            tried["updates"] = options.updates
-            name = "-".join(f"{name}={value:g}" for name, value in tried.items())
-            keep([tried | {"model_seed": run.seed} | row for row in pt_cql(run, config, name)])
+    grid = itertools.product(options.reward_scale, options.imitation, options.target_rate, options.alpha)
+    for scale, imitation, rate, alpha in grid:
+        tried = {"alpha": alpha, "target_rate": rate, "reward_scale": scale, "imitation": imitation}
+        config = replace(base, updates=options.updates, **tried)
+        tried["updates"] = options.updates
+        name = "-".join(f"{name}={value:g}" for name, value in tried.items())
+        keep([tried | {"model_seed": run.seed} | row for row in pt_cql(run, config, name)])
 
 
 def keep(rows: list[dict]) -> None:

@@ -19,6 +19,7 @@ from ct_jax.fit import (
     transformer_loss,
     value_loss,
 )
+from ct_jax.pipeline import make_learner
 from ct_jax.trajectories import sample_windows
 from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork
@@ -69,6 +70,17 @@ def test_the_loss_falls(data, params):
     )
     assert [update for update, _ in losses] == [20, 40, 60, 80, 100, 120]
     assert losses[-1][1] < 0.5 * losses[0][1]
+
+
+def test_bfloat16_learns_alike_and_keeps_its_parameters_in_float32(data, params):
+    losses = {}
+    for precision in ("float32", "bfloat16"):
+        learner = make_learner(MODEL, replace(CONFIG, updates=60, batch=16, precision=precision), 0.8, POINT)
+        seen = losses.setdefault(precision, [])
+        trained = run(learner, params, data, chunk=20, on_progress=lambda update, loss, seen=seen: seen.append(loss))
+        assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(trained))
+    assert losses["float32"] != losses["bfloat16"]
+    np.testing.assert_allclose(losses["bfloat16"], losses["float32"], rtol=0.1)
 
 
 def test_the_seed_decides(learner, params, data):
