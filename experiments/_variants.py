@@ -224,8 +224,12 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
 @functools.cache  # all rows of a run ask
 def controller_digest(where: str, robot: str) -> str:
     """Some letters that tell low-level controllers apart, each named as ``load_controller`` names it."""
-    controller, _ = load_controller(where, robot)
-    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(controller))).hexdigest()[:12]
+    return digest_of(load_controller(where, robot)[0])
+
+
+def digest_of(tree: Any) -> str:
+    """Some letters that tell trees of arrays apart."""
+    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))).hexdigest()[:12]
 
 
 def digest(settings: Settings) -> str:

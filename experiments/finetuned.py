@@ -1,0 +1,79 @@
+"""What fine-tuning adds, on more pairs than a table has: F-CT less CT in the unseen maze, pair by pair.
+
+    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--runs runs/ant]
+
+Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` of ``experiments/ROBOT.py --preset cpu``, led by one
+controller. Both models of a seed meet the same 500 pairs of seed 1; the tables' are 100, of seed 0. Writes
+``experiments/results/finetuned.json``.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from _variants import RESULTS, digest_of, origin
+
+from ct_envs import MazeEnv, UserError, load_maze
+from ct_jax.checkpoint import read_json, write_json
+from ct_jax.cli import guarded, leave, prepare_jax, print_rows
+from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.model import load_model
+from ct_jax.progress import Bar
+from ct_jax.run import default_mazes, provenance
+
+FILE = RESULTS / "finetuned.json"
+PAIRS_SEED = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare."""
+
+    robot: str = "point"
+    """point, ant or humanoid."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the models."""
+    runs: Path | None = None
+    """Folder of the runs (default: runs/ROBOT)."""
+    pairs: int = 500
+    """Start-goal pairs."""
+
+
+def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
+    """One model's row."""
+    run = (options.runs or Path("runs") / options.robot) / f"{variant}-{seed}"
+    model = load_model(str(run))
+    _, unseen = default_mazes(options.robot)
+    maze, env = load_maze(unseen[0]), MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
+    robot = env.robot
+    pairs = draw_pairs(PAIRS_SEED, maze, options.pairs, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    with Bar(f"{run.name} in {unseen[0]}", options.pairs) as bar:
+        episodes = evaluate(
+            env, maze, pairs, "ct", policy=model.policy,
+            on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
+        )  # fmt: skip
+    head = {
+        "robot": model.robot, "variant": variant, "method": "ct", "maze": unseen[0], "seen": False, "model_seed": seed,
+        "episodes": options.pairs, "seed": PAIRS_SEED, "controller": digest_of(model.controller),
+    }  # fmt: skip
+    outcomes = {"success": "".join("01"[int(success)] for success in episodes.success)}
+    return head | episodes.summary() | {"outcomes": outcomes} | origin(provenance()) | {"trained": origin(model.made)}
+
+
+def main(options: Options) -> None:
+    """Measure all and write them down, in place of rows of the same models."""
+    prepare_jax()
+    rows = [measure(options, variant, seed) for seed in options.seeds for variant in ("cpu-ct", "cpu")]
+    for before, after in zip(rows[::2], rows[1::2], strict=True):
+        if before["controller"] != after["controller"]:
+            raise UserError(f"the models of seed {before['model_seed']} were led by different controllers")
+    subject = lambda row: (row["robot"], row["variant"], row["model_seed"])  # noqa: E731
+    kept = read_json(FILE)["rows"] if FILE.is_file() else []
+    anew = set(map(subject, rows))
+    write_json(FILE, {"kind": "finetuned", "rows": [row for row in kept if subject(row) not in anew] + rows})
+    print_rows([row | {"method": row["variant"]} for row in rows])
+
+
+if __name__ == "__main__":
+    leave(guarded(lambda: main(tyro.cli(Options, description=__doc__))))
