@@ -42,6 +42,7 @@ class FitConfig:
     clip: float = 1.0  # norm to which gradients are clipped
     mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
     shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
+    wall_up: float = 0.0  # show a piece in a maze where up to this share of what its trajectory leaves alone is wall
     precision: str = "float32"  # of the transformer's computations; "bfloat16" on accelerators, parameters stay float32
 
 
@@ -109,6 +110,7 @@ class Fit:
                 map_cell_m=self.map_cell_m,
                 symmetries=self._symmetries,
                 shift_timestep=self.config.shift_timestep,
+                wall_up=self.config.wall_up,
             )
             window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
             loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)

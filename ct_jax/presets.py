@@ -261,8 +261,9 @@ def to_dict(settings: Settings) -> dict[str, Any]:
         values.pop("rooms")
     fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
     for fit in filter(None, fits):
-        if fit["precision"] == "float32":  # likewise
-            fit.pop("precision")
+        for name in ("precision", "wall_up"):  # likewise
+            if fit[name] == getattr(FitConfig, name):
+                fit.pop(name)
     return values
 
 

@@ -5,9 +5,11 @@ thousand trajectories take megabytes, not gigabytes. What a lidar showed cannot 
 to the byte.
 """
 
+import functools
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_jax import devices
 
+CLEAR_M = 1.0  # around a trajectory, the maze stays as it is
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
 _MAP_BITS = 2 * MAP_CELLS**2
@@ -182,6 +185,7 @@ def sample_windows(
     map_cell_m: float,
     symmetries: Symmetries | None = None,
     shift_timestep: int = 0,
+    wall_up: float = 0.0,
     overhang: int = 0,
 ) -> Window:
     """Draw pieces of ``steps`` steps: a trajectory by its length, and of it no step less often than another.
@@ -191,9 +195,12 @@ def sample_windows(
         mazes: stacked; ``trajectories.maze`` points into it. Not needed where the trajectories keep their maps.
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
+        wall_up: show each piece in a maze of its own, in which up to this share of the cells that its trajectory leaves
+            alone are walls.
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
+    wall_key = jax.random.fold_in(key, 4)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
@@ -209,7 +216,12 @@ def sample_windows(
     if trajectories.map_bits is not None:
         maps, goal = unpack_maps(take(trajectories.map_bits)), take(trajectories.seen)
     else:
-        maps, goal = _see(trajectories, mazes, which, take(trajectories.position), map_cell_m)
+        maze: Any = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
+        if wall_up:
+            maze = jax.vmap(functools.partial(wall_up_maze, most=wall_up))(
+                jax.random.split(wall_key, batch), maze, trajectories.position[which], length, trajectories.goal[which]
+            )
+        maps, goal = _see(maze, take(trajectories.position), trajectories.goal[which], map_cell_m)
     window = Window(
         map=maps,
         proprio=take(trajectories.proprio),
@@ -228,14 +240,29 @@ def sample_windows(
 
 
 def _see(
-    trajectories: Trajectories, mazes: Maze | None, which: Int[Array, "B"], position: Float[Array, "B S 2"],
-    map_cell_m: float,
-) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:  # fmt: skip
-    """Local maps and vectors to the goal [m] at positions [m] in the mazes of the trajectories ``which``."""
-    goal = trajectories.goal[which]
-    maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
+    maze: Maze, position: Float[Array, "B S 2"], goal: Float[Array, "B 2"], map_cell_m: float
+) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:
+    """Local maps and vectors to the goal [m] at positions [m], each piece in a maze of its own."""
     see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
     return jax.vmap(see)(maze, position, goal), goal[:, None] - position
+
+
+def wall_up_maze(
+    key: jax.Array, maze: Maze, position: Float[Array, "T 2"], length: Int[Array, ""], goal: Float[Array, "2"], *,
+    most: float,
+) -> Maze:  # fmt: skip
+    """A maze for a trajectory of this length: some cells that it leaves alone, ``most`` of them at most, become walls.
+
+    What the trajectory does is as right there as where it was made, for it meets the same walls; but who has learned
+    the maze by heart is lost. Cells within ``CLEAR_M`` of it stay as they are.
+    """
+    share_key, cell_key = jax.random.split(key)
+    around = CLEAR_M * jnp.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+    position = jnp.where(jnp.arange(len(position) + 1)[:, None] < length, jnp.concatenate([position, goal[None]]), goal)
+    column, row = jnp.moveaxis(jnp.floor((position[:, None] + around[None]) / maze.cell_m).astype(jnp.int32), -1, 0)
+    left_alone = jnp.ones(maze.shape, bool).at[row, column].set(False)
+    walled = jax.random.uniform(cell_key, maze.shape) < most * jax.random.uniform(share_key)
+    return maze.replace(walls=maze.walls | (left_alone & walled))
 
 
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:

@@ -71,7 +71,7 @@ def main(options: Options) -> None:
     subject = lambda row: (row["robot"], row["variant"], row["model_seed"])  # noqa: E731
     kept = read_json(FILE)["rows"] if FILE.is_file() else []
     anew = set(map(subject, rows))
-    write_json(FILE, {"kind": "finetuned", "rows": [row for row in kept if subject(row) not in anew] + rows})
+    write_json(FILE, {"rows": [row for row in kept if subject(row) not in anew] + rows})
     print_rows([row | {"method": row["variant"]} for row in rows])
 
 

@@ -18,6 +18,7 @@ from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
 FINE_TUNED = {"F-CT": "CT", "F-CT, `cpu`": "CT, `cpu-ct`"}  # and what each was before
+_ORDER = ["CT", "BC-CT", "F-CT", "PT-CQL", "SAC alone", "CT, `cpu-ct`", "F-CT, `cpu`"]
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
@@ -28,7 +29,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     names = ["maze", "method", "success %", "each model", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     together: dict[tuple[bool, str, str], list[dict[str, Any]]] = {}
-    for row in sorted(rows, key=lambda row: not row["seen"]):
+    for row in sorted(rows, key=lambda row: (not row["seen"], _place(row))):
         together.setdefault((row["seen"], row["maze"], method_name(row)), []).append(row)
     for (seen, maze, name), models in together.items():
         cells = [f"{maze} ({'seen' if seen else 'unseen'})", name, pooled(models, "success"), each_model(models)]
@@ -74,6 +75,12 @@ def method_name(row: dict[str, Any]) -> str:
         return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
     named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT", "cpu": "F-CT, `cpu`"}
     return named.get(variant, f"CT, `{variant}`")
+
+
+def _place(row: dict[str, Any]) -> int:
+    """Where a row stands in its maze: as the paper has them, then what lifts them, then the references."""
+    name = method_name(row)
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
 
 
 def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
@@ -219,11 +226,46 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", name]
 
 
-def _table(data: Any) -> list[str]:
+def finetuned_table(results: dict[str, Any]) -> list[str]:
+    """One line a robot: CT, F-CT and what lies between them, of the models of all seeds."""
+    lines = ["| robot | models | CT % | F-CT % | F-CT less CT, of 100 |", "|---|---|---|---|---|"]
+    rows = results["rows"]
+    for robot in dict.fromkeys(row["robot"] for row in rows):
+        before, after = (
+            sorted((r for r in rows if (r["robot"], r["variant"]) == (robot, variant)), key=lambda r: r["model_seed"])
+            for variant in ("cpu-ct", "cpu")
+        )
+        changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
+        low, high = interval_of_mean(np.stack(changes))
+        gain = f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+        cells = [robot, str(len(before)), pooled(before, "success"), pooled(after, "success"), gain]
+        lines.append("| " + " | ".join(cells) + " |")
+    trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
+    on = f"{rows[0]['episodes']} pairs of seed {rows[0]['seed']} in {rows[0]['maze']}"
+    return [*lines, "", f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}."]
+
+
+def cql_table(results: dict[str, Any]) -> list[str]:
+    """One line for each settings of PT-CQL that were tried."""
+    names = ["robot", "alpha", "target rate", "reward scale", "imitation", "updates", "success %"]
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    rows = results["rows"]
+    tried = ("alpha", "target_rate", "reward_scale", "imitation", "updates")
+    for row in rows:
+        cells = [row["robot"], *(f"{row[name]:g}" for name in tried), pooled([row], "success")]
+        lines.append("| " + " | ".join(cells) + " |")
+    on = f"{rows[0]['episodes']} pairs of seed {rows[0]['seed']} in {rows[0]['maze']}"
+    return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+
+
+TABLES = {"finetuned": finetuned_table, "cql": cql_table, "transfer": transfer_table}  # by the file's name
+
+
+def _table(name: str, data: Any) -> list[str]:
+    if name in TABLES:
+        return TABLES[name](data)
     if not isinstance(data, dict):
         return benchmark_table(data)
-    if "start" in data["rows"][0]:
-        return transfer_table(data)
     return room_table(data) if "worlds" in data["rows"][0] else experiment_table(data)
 
 
@@ -241,7 +283,7 @@ def main() -> int:
     text = readme.read_text("utf-8")
     for file in sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")]):
         data = json.loads(file.read_text("utf-8"))
-        text = put(text, file.stem, _table(data))
+        text = put(text, file.stem, _table(file.stem, data))
     readme.write_text(text, "utf-8")
     return 0
 

@@ -21,12 +21,13 @@ from ct_jax.trajectories import (
     save,
     select,
     unpack_maps,
+    wall_up_maze,
 )
 
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
 LENGTHS = [3, 17, 40]
 CELL = 0.8
-draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep"))
+draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep", "wall_up"))
 GROUP = symmetries(POINT)
 
 
@@ -142,6 +143,42 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
     assert (shift == shift[:, :1]).all()
     assert set(shift[:, 0]) == set(range(10))
     assert_same(shifted.replace(timestep=plain.timestep), plain)
+
+
+# ---------------------------------------------------------------------------------------------- walled-up mazes
+
+
+def test_a_walled_up_maze_is_the_same_for_its_trajectory():
+    """No wall goes, none comes within a metre of the way or the goal, and elsewhere some come: a share that varies."""
+    maze, goal = load_maze("antmaze-large"), jnp.array([6.0, 10.0])
+    way = jnp.stack([jnp.linspace(6.0, 10.9, 30), jnp.full(30, 6.0)], 1)
+    steps = np.array([(x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)])
+    points = np.concatenate([way, goal[None]])[:, None] + steps[None]
+    column, row = np.moveaxis(np.floor(points / 4.0).astype(int), -1, 0)
+    wall_up = jax.jit(jax.vmap(lambda key: wall_up_maze(key, maze, way, jnp.int32(30), goal, most=0.5).walls))
+    walls, before = np.asarray(wall_up(jax.random.split(jax.random.key(0), 400))), np.asarray(maze.walls)
+    near = np.zeros(before.shape, bool)
+    near[row, column] = True
+    assert walls[:, before].all() and (walls[:, near] == before[near]).all()
+    shares = walls[:, ~before & ~near].mean(1)
+    assert shares.mean() == pytest.approx(0.25, abs=0.02) and shares.std() > 0.1
+
+
+def test_what_is_padding_keeps_no_cell_free(toy_data):
+    data, maze = toy_data([40], seed=2), load_maze("antmaze-umaze")
+    one = wall_up_maze(jax.random.key(1), maze, data.position[0], 5, data.goal[0], most=1.0)
+    beyond = jnp.asarray(data.position[0]).at[5:].set(2 * 4.0 + 2.0)
+    other = wall_up_maze(jax.random.key(1), maze, beyond, 5, data.goal[0], most=1.0)
+    np.testing.assert_array_equal(one.walls, other.walls)
+
+
+def test_walling_up_changes_the_maps_alone(toy_data):
+    data = toy_data(LENGTHS)
+    plain, walled = windows(data, seed=1, batch=200), windows(data, seed=1, batch=200, wall_up=0.9)
+    assert_same(walled.replace(map=plain.map), plain)
+    walls, before = np.asarray(walled.map)[:, :, 0], np.asarray(plain.map)[:, :, 0]
+    assert (walls >= before).all() and (walls > before).any()
+    np.testing.assert_array_equal(np.asarray(walled.map)[:, :, 1], np.asarray(plain.map)[:, :, 1])
 
 
 # ------------------------------------------------------------------------------------------------- symmetries
