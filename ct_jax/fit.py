@@ -23,7 +23,7 @@ from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
-from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
+from ct_jax.trajectories import Trajectories, Window, at_goal, left_alone, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -218,6 +218,8 @@ def fit(
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, params)
+    if learner.config.wall_up and mazes is not None:
+        data = data.replace(alone=left_alone(data, mazes))
     data, rtg = spread(data, learner.mesh)
     mazes = place(mazes, replicated(learner.mesh))
     state = run_to(

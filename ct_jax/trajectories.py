@@ -5,7 +5,6 @@ thousand trajectories take megabytes, not gigabytes. What a lidar showed cannot 
 to the byte.
 """
 
-import functools
 import zipfile
 import zlib
 from pathlib import Path
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ct_envs import UserError
 from ct_envs.frames import Symmetries, transform
@@ -49,6 +48,7 @@ class Trajectories:
     # What cannot be recomputed from a maze; both or neither.
     seen: Float[Array, "N T 2"] | None = None  # vector to the final goal, as it was observed [m]
     map_bits: UInt8[Array, "N T 157"] | None = None  # see ``pack_maps``
+    alone: Bool[Array, "N H W"] | None = None  # see ``left_alone``; while training with ``wall_up``
 
     @property
     def n(self) -> int:
@@ -196,7 +196,7 @@ def sample_windows(
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
         wall_up: show each piece in a maze of its own, in which up to this share of the cells that its trajectory leaves
-            alone are walls.
+            alone (``trajectories.alone``) are walls.
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
@@ -218,9 +218,10 @@ def sample_windows(
     else:
         maze: Any = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
         if wall_up:
-            maze = jax.vmap(functools.partial(wall_up_maze, most=wall_up))(
-                jax.random.split(wall_key, batch), maze, trajectories.position[which], length, trajectories.goal[which]
-            )
+            share_key, cell_key = jax.random.split(wall_key)
+            share = wall_up * jax.random.uniform(share_key, (batch, 1, 1))
+            walled = jax.random.uniform(cell_key, maze.walls.shape) < share
+            maze = maze.replace(walls=maze.walls | (walled & trajectories.alone[which]))
         maps, goal = _see(maze, take(trajectories.position), trajectories.goal[which], map_cell_m)
     window = Window(
         map=maps,
@@ -247,22 +248,22 @@ def _see(
     return jax.vmap(see)(maze, position, goal), goal[:, None] - position
 
 
-def wall_up_maze(
-    key: jax.Array, maze: Maze, position: Float[Array, "T 2"], length: Int[Array, ""], goal: Float[Array, "2"], *,
-    most: float,
-) -> Maze:  # fmt: skip
-    """A maze for a trajectory of this length: some cells that it leaves alone, ``most`` of them at most, become walls.
+def left_alone(trajectories: Trajectories, mazes: Maze) -> Bool[np.ndarray, "N H W"]:
+    """Which cells of its maze, of the stacked ``mazes``, each trajectory leaves alone: farther than ``CLEAR_M`` from it
+    and its goal.
 
-    What the trajectory does is as right there as where it was made, for it meets the same walls; but who has learned
-    the maze by heart is lost. Cells within ``CLEAR_M`` of it stay as they are.
+    A trajectory is as right where some of them are walls, for it meets the same walls there; but who has learned the
+    maze by heart is lost.
     """
-    share_key, cell_key = jax.random.split(key)
-    around = CLEAR_M * jnp.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-    position = jnp.where(jnp.arange(len(position) + 1)[:, None] < length, jnp.concatenate([position, goal[None]]), goal)
-    column, row = jnp.moveaxis(jnp.floor((position[:, None] + around[None]) / maze.cell_m).astype(jnp.int32), -1, 0)
-    left_alone = jnp.ones(maze.shape, bool).at[row, column].set(False)
-    walled = jax.random.uniform(cell_key, maze.shape) < most * jax.random.uniform(share_key)
-    return maze.replace(walls=maze.walls | (left_alone & walled))
+    alone = np.ones((trajectories.n, *mazes.shape), bool)
+    position, goal = np.asarray(trajectories.position), np.asarray(trajectories.goal)[:, None]
+    inside = np.arange(position.shape[1])[None] < np.asarray(trajectories.length)[:, None]
+    way = np.concatenate([np.where(inside[..., None], position, goal), goal], 1)
+    cell_m = np.asarray(mazes.cell_m)[np.asarray(trajectories.maze)][:, None]
+    for x, y in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        column, row = (((way[..., i] + CLEAR_M * step) // cell_m).astype(int) for i, step in enumerate((x, y)))
+        alone[np.arange(len(way))[:, None], row, column] = False
+    return alone
 
 
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:

@@ -13,6 +13,7 @@ from ct_envs.occupancy import local_map
 from ct_jax.trajectories import (
     Trajectories,
     concatenate,
+    left_alone,
     load,
     mirror_windows,
     pack_maps,
@@ -21,7 +22,6 @@ from ct_jax.trajectories import (
     save,
     select,
     unpack_maps,
-    wall_up_maze,
 )
 
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
@@ -148,37 +148,34 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
 # ---------------------------------------------------------------------------------------------- walled-up mazes
 
 
-def test_a_walled_up_maze_is_the_same_for_its_trajectory():
-    """No wall goes, none comes within a metre of the way or the goal, and elsewhere some come: a share that varies."""
-    maze, goal = load_maze("antmaze-large"), jnp.array([6.0, 10.0])
-    way = jnp.stack([jnp.linspace(6.0, 10.9, 30), jnp.full(30, 6.0)], 1)
+def test_cells_near_a_trajectory_are_not_left_alone(toy_data):
+    """None within a metre of the way or the goal; and no other counts, what lies after the end included."""
+    way = np.stack([np.linspace(6.0, 10.9, 30), np.full(30, 6.0)], 1)
+    data = toy_data([20], steps=30)
+    data = data.replace(position=way[None].astype(np.float32), goal=np.array([[6.0, 10.0]], np.float32))
+    maze = load_maze("antmaze-large")
     steps = np.array([(x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)])
-    points = np.concatenate([way, goal[None]])[:, None] + steps[None]
+    points = np.concatenate([way[:20], data.goal])[:, None] + steps[None]
     column, row = np.moveaxis(np.floor(points / 4.0).astype(int), -1, 0)
-    wall_up = jax.jit(jax.vmap(lambda key: wall_up_maze(key, maze, way, jnp.int32(30), goal, most=0.5).walls))
-    walls, before = np.asarray(wall_up(jax.random.split(jax.random.key(0), 400))), np.asarray(maze.walls)
-    near = np.zeros(before.shape, bool)
-    near[row, column] = True
-    assert walls[:, before].all() and (walls[:, near] == before[near]).all()
-    shares = walls[:, ~before & ~near].mean(1)
-    assert shares.mean() == pytest.approx(0.25, abs=0.02) and shares.std() > 0.1
+    expected = np.ones(maze.shape, bool)
+    expected[row, column] = False
+    data = data.replace(maze=np.zeros(1, np.int32))
+    np.testing.assert_array_equal(left_alone(data, stack_mazes([maze]))[0], expected)
 
 
-def test_what_is_padding_keeps_no_cell_free(toy_data):
-    data, maze = toy_data([40], seed=2), load_maze("antmaze-umaze")
-    one = wall_up_maze(jax.random.key(1), maze, data.position[0], 5, data.goal[0], most=1.0)
-    beyond = jnp.asarray(data.position[0]).at[5:].set(2 * 4.0 + 2.0)
-    other = wall_up_maze(jax.random.key(1), maze, beyond, 5, data.goal[0], most=1.0)
-    np.testing.assert_array_equal(one.walls, other.walls)
-
-
-def test_walling_up_changes_the_maps_alone(toy_data):
+def test_walling_up_adds_walls_where_nothing_went(toy_data):
+    """In the maps alone, more in some pieces than in others, and the same for all steps of a piece."""
     data = toy_data(LENGTHS)
-    plain, walled = windows(data, seed=1, batch=200), windows(data, seed=1, batch=200, wall_up=0.9)
+    alone = np.zeros((3, *MAZES.shape), bool)
+    alone[:, 1, :] = True
+    data = data.replace(alone=alone)
+    plain, walled = windows(data, seed=1, batch=200), windows(data, seed=1, batch=200, wall_up=1.0)
     assert_same(walled.replace(map=plain.map), plain)
     walls, before = np.asarray(walled.map)[:, :, 0], np.asarray(plain.map)[:, :, 0]
     assert (walls >= before).all() and (walls > before).any()
     np.testing.assert_array_equal(np.asarray(walled.map)[:, :, 1], np.asarray(plain.map)[:, :, 1])
+    none = windows(data.replace(alone=np.zeros_like(alone)), seed=1, batch=200, wall_up=1.0)
+    assert_same(none, plain)
 
 
 # ------------------------------------------------------------------------------------------------- symmetries
