@@ -54,12 +54,14 @@ PUBLISHED = replace(
 )
 """The method as published in everything but size: a model, a memory and a number of updates for two CPU cores."""
 
-_LIFTED = FitConfig(batch=24, steps=80, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True)
+_LIFTED = FitConfig(
+    batch=24, steps=80, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True, shift_timestep=300
+)
 
 CPU = replace(
     PUBLISHED,
     prm=PrmConfig(margin_m=0.3),
-    collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
+    collect=CollectConfig(trajectories=1000, guide="explorer", remember=48, starts="maze", noise=0.5),
     model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0, actions=False),
     fit=replace(_LIFTED, updates=800),
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
@@ -70,8 +72,8 @@ CPU = replace(
     round_fit=replace(_LIFTED, updates=300, warmup=20),
     last_fit=replace(_LIFTED, updates=2500, warmup=20, decay=True),
 )
-"""What lifts the method on two CPU cores: a teacher that knows no more than its pupil, free starts, disturbances,
-mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
+"""What lifts the method on two CPU cores: a teacher that knows, and remembers, no more than its pupil, free starts,
+disturbances, mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
 
 DEMO = replace(
     CPU,
@@ -175,9 +177,10 @@ def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float
     if not settings.reprompt:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)
+    collect = replace(settings.collect, remember=64)
     fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
     longer = {name: replace(fit, steps=96) for name, fit in fits.items() if fit is not None}
-    return replace(settings, model=model, **longer)
+    return replace(settings, model=model, collect=collect, **longer)
 
 
 TURTLEBOT3_PAPER = Settings(
@@ -259,11 +262,11 @@ def to_dict(settings: Settings) -> dict[str, Any]:
     values = asdict(settings)
     if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
         values.pop("rooms")
-    fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
-    for fit in filter(None, fits):
-        for name in ("precision", "wall_up"):  # likewise
-            if fit[name] == getattr(FitConfig, name):
-                fit.pop(name)
+    fits = filter(None, (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit"))))
+    later = [(fit, FitConfig, name) for fit in fits for name in ("precision", "wall_up")]
+    for part, kind, name in (*later, (values["collect"], CollectConfig, "remember")):  # likewise
+        if part[name] == getattr(kind, name):
+            part.pop(name)
     return values
 
 
