@@ -23,7 +23,7 @@ from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
-from ct_jax.trajectories import Trajectories, Window, at_goal, left_alone, pad, sample_windows, select
+from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -42,7 +42,6 @@ class FitConfig:
     clip: float = 1.0  # norm to which gradients are clipped
     mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
     shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
-    wall_up: float = 0.0  # show a piece in a maze where up to this share of what its trajectory leaves alone is wall
     precision: str = "float32"  # of the transformer's computations; "bfloat16" on accelerators, parameters stay float32
 
 
@@ -110,7 +109,6 @@ class Fit:
                 map_cell_m=self.map_cell_m,
                 symmetries=self._symmetries,
                 shift_timestep=self.config.shift_timestep,
-                wall_up=self.config.wall_up,
             )
             window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
             loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)
@@ -218,8 +216,6 @@ def fit(
         checkpoints: where to go on from, and where to save now and then and when interrupted.
     """
     state = learner.create(key, params)
-    if learner.config.wall_up and mazes is not None:
-        data = data.replace(alone=left_alone(data, mazes))
     data, rtg = spread(data, learner.mesh)
     mazes = place(mazes, replicated(learner.mesh))
     state = run_to(

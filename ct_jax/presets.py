@@ -263,7 +263,7 @@ def to_dict(settings: Settings) -> dict[str, Any]:
     if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
         values.pop("rooms")
     fits = filter(None, (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit"))))
-    later = [(fit, FitConfig, name) for fit in fits for name in ("precision", "wall_up")]
+    later = [(fit, FitConfig, "precision") for fit in fits]
     for part, kind, name in (*later, (values["collect"], CollectConfig, "remember")):  # likewise
         if part[name] == getattr(kind, name):
             part.pop(name)

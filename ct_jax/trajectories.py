@@ -8,13 +8,12 @@ to the byte.
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from ct_envs import UserError
 from ct_envs.frames import Symmetries, transform
@@ -22,7 +21,6 @@ from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_jax import devices
 
-CLEAR_M = 1.0  # around a trajectory, the maze stays as it is
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
 _MAP_BITS = 2 * MAP_CELLS**2
@@ -48,7 +46,6 @@ class Trajectories:
     # What cannot be recomputed from a maze; both or neither.
     seen: Float[Array, "N T 2"] | None = None  # vector to the final goal, as it was observed [m]
     map_bits: UInt8[Array, "N T 157"] | None = None  # see ``pack_maps``
-    alone: Bool[Array, "N H W"] | None = None  # see ``left_alone``; while training with ``wall_up``
 
     @property
     def n(self) -> int:
@@ -185,7 +182,6 @@ def sample_windows(
     map_cell_m: float,
     symmetries: Symmetries | None = None,
     shift_timestep: int = 0,
-    wall_up: float = 0.0,
     overhang: int = 0,
 ) -> Window:
     """Draw pieces of ``steps`` steps: a trajectory by its length, and of it no step less often than another.
@@ -195,12 +191,9 @@ def sample_windows(
         mazes: stacked; ``trajectories.maze`` points into it. Not needed where the trajectories keep their maps.
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
-        wall_up: show each piece in a maze of its own, in which up to this share of the cells that its trajectory leaves
-            alone (``trajectories.alone``) are walls.
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
-    wall_key = jax.random.fold_in(key, 4)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
@@ -216,13 +209,7 @@ def sample_windows(
     if trajectories.map_bits is not None:
         maps, goal = unpack_maps(take(trajectories.map_bits)), take(trajectories.seen)
     else:
-        maze: Any = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
-        if wall_up:
-            share_key, cell_key = jax.random.split(wall_key)
-            share = wall_up * jax.random.uniform(share_key, (batch, 1, 1))
-            walled = jax.random.uniform(cell_key, maze.walls.shape) < share
-            maze = maze.replace(walls=maze.walls | (walled & trajectories.alone[which]))
-        maps, goal = _see(maze, take(trajectories.position), trajectories.goal[which], map_cell_m)
+        maps, goal = _see(trajectories, mazes, which, take(trajectories.position), map_cell_m)
     window = Window(
         map=maps,
         proprio=take(trajectories.proprio),
@@ -241,29 +228,14 @@ def sample_windows(
 
 
 def _see(
-    maze: Maze, position: Float[Array, "B S 2"], goal: Float[Array, "B 2"], map_cell_m: float
-) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:
-    """Local maps and vectors to the goal [m] at positions [m], each piece in a maze of its own."""
+    trajectories: Trajectories, mazes: Maze | None, which: Int[Array, "B"], position: Float[Array, "B S 2"],
+    map_cell_m: float,
+) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:  # fmt: skip
+    """Local maps and vectors to the goal [m] at positions [m] in the mazes of the trajectories ``which``."""
+    goal = trajectories.goal[which]
+    maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
     see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
     return jax.vmap(see)(maze, position, goal), goal[:, None] - position
-
-
-def left_alone(trajectories: Trajectories, mazes: Maze) -> Bool[np.ndarray, "N H W"]:
-    """Which cells of its maze, of the stacked ``mazes``, each trajectory leaves alone: farther than ``CLEAR_M`` from it
-    and its goal.
-
-    A trajectory is as right where some of them are walls, for it meets the same walls there; but who has learned the
-    maze by heart is lost.
-    """
-    alone = np.ones((trajectories.n, *mazes.shape), bool)
-    position, goal = np.asarray(trajectories.position), np.asarray(trajectories.goal)[:, None]
-    inside = np.arange(position.shape[1])[None] < np.asarray(trajectories.length)[:, None]
-    way = np.concatenate([np.where(inside[..., None], position, goal), goal], 1)
-    cell_m = np.asarray(mazes.cell_m)[np.asarray(trajectories.maze)][:, None]
-    for x, y in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        column, row = (((way[..., i] + CLEAR_M * step) // cell_m).astype(int) for i, step in enumerate((x, y)))
-        alone[np.arange(len(way))[:, None], row, column] = False
-    return alone
 
 
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:

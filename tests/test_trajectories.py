@@ -13,7 +13,6 @@ from ct_envs.occupancy import local_map
 from ct_jax.trajectories import (
     Trajectories,
     concatenate,
-    left_alone,
     load,
     mirror_windows,
     pack_maps,
@@ -27,7 +26,7 @@ from ct_jax.trajectories import (
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
 LENGTHS = [3, 17, 40]
 CELL = 0.8
-draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep", "wall_up"))
+draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep"))
 GROUP = symmetries(POINT)
 
 
@@ -143,39 +142,6 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
     assert (shift == shift[:, :1]).all()
     assert set(shift[:, 0]) == set(range(10))
     assert_same(shifted.replace(timestep=plain.timestep), plain)
-
-
-# ---------------------------------------------------------------------------------------------- walled-up mazes
-
-
-def test_cells_near_a_trajectory_are_not_left_alone(toy_data):
-    """None within a metre of the way or the goal; and no other counts, what lies after the end included."""
-    way = np.stack([np.linspace(6.0, 10.9, 30), np.full(30, 6.0)], 1)
-    data = toy_data([20], steps=30)
-    data = data.replace(position=way[None].astype(np.float32), goal=np.array([[6.0, 10.0]], np.float32))
-    maze = load_maze("antmaze-large")
-    steps = np.array([(x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)])
-    points = np.concatenate([way[:20], data.goal])[:, None] + steps[None]
-    column, row = np.moveaxis(np.floor(points / 4.0).astype(int), -1, 0)
-    expected = np.ones(maze.shape, bool)
-    expected[row, column] = False
-    data = data.replace(maze=np.zeros(1, np.int32))
-    np.testing.assert_array_equal(left_alone(data, stack_mazes([maze]))[0], expected)
-
-
-def test_walling_up_adds_walls_where_nothing_went(toy_data):
-    """In the maps alone, more in some pieces than in others, and the same for all steps of a piece."""
-    data = toy_data(LENGTHS)
-    alone = np.zeros((3, *MAZES.shape), bool)
-    alone[:, 1, :] = True
-    data = data.replace(alone=alone)
-    plain, walled = windows(data, seed=1, batch=200), windows(data, seed=1, batch=200, wall_up=1.0)
-    assert_same(walled.replace(map=plain.map), plain)
-    walls, before = np.asarray(walled.map)[:, :, 0], np.asarray(plain.map)[:, :, 0]
-    assert (walls >= before).all() and (walls > before).any()
-    np.testing.assert_array_equal(np.asarray(walled.map)[:, :, 1], np.asarray(plain.map)[:, :, 1])
-    none = windows(data.replace(alone=np.zeros_like(alone)), seed=1, batch=200, wall_up=1.0)
-    assert_same(none, plain)
 
 
 # ------------------------------------------------------------------------------------------------- symmetries
