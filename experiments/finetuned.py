@@ -1,9 +1,11 @@
-"""What fine-tuning adds, on more pairs than a table has: F-CT less CT in the unseen maze, pair by pair.
+"""What fine-tuning adds, on more pairs than a table has: F-CT less CT in unseen mazes, pair by pair.
 
-    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--runs runs/ant]
+    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--runs runs/ant] [--maze validation-2]
+
+In ``antmaze-large-eval``, and for the choice of settings in mazes ``validation-1`` to ``-3``, of which no table is made.
 
 Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` of ``experiments/ROBOT.py --preset cpu``, led by one
-controller. Both models of a seed meet the same 500 pairs of seed 1; the tables' are 100, of seed 0. Writes
+controller. Both models of a seed meet the same pairs of seed 1; the tables' are of seed 0. Writes
 ``experiments/results/finetuned.json``.
 """
 
@@ -20,7 +22,7 @@ from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.evaluate import draw_pairs, evaluate
 from ct_jax.model import load_model
 from ct_jax.progress import Bar
-from ct_jax.run import default_mazes, provenance
+from ct_jax.run import provenance
 
 FILE = RESULTS / "finetuned.json"
 PAIRS_SEED = 1
@@ -36,25 +38,26 @@ class Options:
     """Seeds of the models."""
     runs: Path | None = None
     """Folder of the runs (default: runs/ROBOT)."""
+    maze: tuple[str, ...] = ("antmaze-large-eval",)
+    """Mazes to compare in."""
     pairs: int = 500
     """Start-goal pairs."""
 
 
-def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
+def measure(options: Options, variant: str, seed: int, maze_name: str) -> dict[str, Any]:
     """One model's row."""
     run = (options.runs or Path("runs") / options.robot) / f"{variant}-{seed}"
-    model = load_model(str(run))
-    _, unseen = default_mazes(options.robot)
-    maze, env = load_maze(unseen[0]), MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
+    model, maze = load_model(str(run)), load_maze(maze_name)
+    env = MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
     robot = env.robot
     pairs = draw_pairs(PAIRS_SEED, maze, options.pairs, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    with Bar(f"{run.name} in {unseen[0]}", options.pairs) as bar:
+    with Bar(f"{run.name} in {maze_name}", options.pairs) as bar:
         episodes = evaluate(
             env, maze, pairs, "ct", policy=model.policy,
             on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
         )  # fmt: skip
     head = {
-        "robot": model.robot, "variant": variant, "method": "ct", "maze": unseen[0], "seen": False, "model_seed": seed,
+        "robot": model.robot, "variant": variant, "method": "ct", "maze": maze_name, "seen": False, "model_seed": seed,
         "episodes": options.pairs, "seed": PAIRS_SEED, "controller": digest_of(model.controller),
     }  # fmt: skip
     outcomes = {"success": "".join("01"[int(success)] for success in episodes.success)}
@@ -64,11 +67,12 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
 def main(options: Options) -> None:
     """Measure all and write them down, in place of rows of the same models."""
     prepare_jax()
-    rows = [measure(options, variant, seed) for seed in options.seeds for variant in ("cpu-ct", "cpu")]
+    variants = ("cpu-ct", "cpu")
+    rows = [measure(options, v, seed, maze) for seed in options.seeds for maze in options.maze for v in variants]
     for before, after in zip(rows[::2], rows[1::2], strict=True):
         if before["controller"] != after["controller"]:
             raise UserError(f"the models of seed {before['model_seed']} were led by different controllers")
-    subject = lambda row: (row["robot"], row["variant"], row["model_seed"])  # noqa: E731
+    subject = lambda row: (row["robot"], row["maze"], row["variant"], row["model_seed"])  # noqa: E731
     kept = read_json(FILE)["rows"] if FILE.is_file() else []
     anew = set(map(subject, rows))
     write_json(FILE, {"rows": [row for row in kept if subject(row) not in anew] + rows})

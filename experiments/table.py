@@ -227,21 +227,20 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def finetuned_table(results: dict[str, Any]) -> list[str]:
-    """One line a robot: CT, F-CT and what lies between them, of the models of all seeds."""
-    lines = ["| robot | models | CT % | F-CT % | F-CT less CT, of 100 |", "|---|---|---|---|---|"]
+    """One line for each robot and maze: CT, F-CT and what lies between them, of the models of all seeds."""
+    lines = ["| robot | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 7 + "|"]
     rows = results["rows"]
-    for robot in dict.fromkeys(row["robot"] for row in rows):
-        before, after = (
-            sorted((r for r in rows if (r["robot"], r["variant"]) == (robot, variant)), key=lambda r: r["model_seed"])
-            for variant in ("cpu-ct", "cpu")
-        )
+    for robot, maze in dict.fromkeys((row["robot"], row["maze"]) for row in rows):
+        here = sorted((r for r in rows if (r["robot"], r["maze"]) == (robot, maze)), key=lambda r: r["model_seed"])
+        before, after = ([r for r in here if r["variant"] == variant] for variant in ("cpu-ct", "cpu"))
         changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
         low, high = interval_of_mean(np.stack(changes))
         gain = f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
-        cells = [robot, str(len(before)), pooled(before, "success"), pooled(after, "success"), gain]
+        counts = [str(len(before)), str(before[0]["episodes"])]
+        cells = [robot, maze, *counts, pooled(before, "success"), pooled(after, "success"), gain]
         lines.append("| " + " | ".join(cells) + " |")
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
-    on = f"{rows[0]['episodes']} pairs of seed {rows[0]['seed']} in {rows[0]['maze']}"
+    on = f"pairs of seed {rows[0]['seed']}"
     return [*lines, "", f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}."]
 
 
