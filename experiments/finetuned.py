@@ -2,7 +2,7 @@
 
     python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--runs runs/ant] [--maze validation-2]
 
-In ``antmaze-large-eval``, and for the choice of settings in mazes ``validation-1`` to ``-3``, of which no table is made.
+In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, of which no table is made.
 
 Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` of ``experiments/ROBOT.py --preset cpu``, led by one
 controller. Both models of a seed meet the same pairs of seed 1; the tables' are of seed 0. Writes
