@@ -36,7 +36,7 @@ class Options:
     """Of the reward in the critics' units."""
     imitation: tuple[int, ...] = (0,)
     """First updates in which the policy imitates the data."""
-    updates: int = 8000
+    updates: int = 2500
     """Of each training."""
     controller: str = "zoo"
     """own, zoo, or a run folder."""
