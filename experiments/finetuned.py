@@ -65,13 +65,18 @@ def measure(options: Options, variant: str, seed: int, maze_name: str) -> dict[s
 
 
 def main(options: Options) -> None:
-    """Measure all and write them down, in place of rows of the same models."""
+    """Measure all, seed by seed and maze by maze, and write each down as it is there."""
     prepare_jax()
-    variants = ("cpu-ct", "cpu")
-    rows = [measure(options, v, seed, maze) for seed in options.seeds for maze in options.maze for v in variants]
-    for before, after in zip(rows[::2], rows[1::2], strict=True):
-        if before["controller"] != after["controller"]:
-            raise UserError(f"the models of seed {before['model_seed']} were led by different controllers")
+    for seed in options.seeds:
+        for maze in options.maze:
+            before, after = (measure(options, variant, seed, maze) for variant in ("cpu-ct", "cpu"))
+            if before["controller"] != after["controller"]:
+                raise UserError(f"the models of seed {seed} were led by different controllers")
+            keep([before, after])
+
+
+def keep(rows: list[dict[str, Any]]) -> None:
+    """Write rows down in place of those of the same models and mazes, and print them."""
     subject = lambda row: (row["robot"], row["maze"], row["variant"], row["model_seed"])  # noqa: E731
     kept = read_json(FILE)["rows"] if FILE.is_file() else []
     anew = set(map(subject, rows))
