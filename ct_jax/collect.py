@@ -11,7 +11,7 @@ from brax.envs.base import State
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.devices import data_mesh, fill_up, joined, own, own_rows, place, sharded
-from ct_jax.explorer import NEVER, ExplorerGuide
+from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap
 from ct_jax.rollout import Controller, Guided, Steps, rollout
@@ -28,7 +28,6 @@ class CollectConfig:
     trajectories: int = 1000  # T: successes to collect
     reset_interval: int = 25  # L: episodes on one roadmap
     guide: str = "roadmap"  # whose plan: "roadmap" point by point, "shortcut" over it, "explorer" (knows no map)
-    remember: int = NEVER  # steps after which "explorer" forgets what it saw: a pupil's memory has an end, too
     starts: str = "vertices"  # starts and goals: roadmap "vertices" (paper) or free points of the "maze"
     noise: float = 0.0  # size of a disturbance of the actions that is not imitated
     envs: int = 250  # episodes at a time
@@ -109,11 +108,11 @@ def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Traject
     )
 
 
-def make_guide(name: str, env: MazeEnv, prm: PrmConfig, remember: int = NEVER) -> RoadmapGuide | ExplorerGuide:
-    """The guide of that name; the explorer remembers for so many steps. Raises UserError with the valid names."""
+def make_guide(name: str, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | ExplorerGuide:
+    """The guide of that name. Raises UserError with the valid names."""
     radius, cell_m = env.robot.radius_m, env.engine.cell_m
     if name == "explorer":
-        return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, remember, prm.connect_m)
+        return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, prm.connect_m)
     if name not in GUIDES:
         raise UserError(f"no guide named '{name}'; guides: {', '.join(GUIDES)}")
     return RoadmapGuide(radius, prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")
@@ -139,7 +138,7 @@ def collect(
     Raises:
         UserError: too few successes within ``give_up * T`` episodes, or names that mean nothing.
     """
-    policy = Guided(controller, make_guide(config.guide, env, prm, config.remember), config.noise)
+    policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray]:
         batch_key, run_key = jax.random.split(jax.random.fold_in(key, first))

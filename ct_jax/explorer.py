@@ -10,19 +10,17 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ct_envs.maze import Maze, cell_of, in_sight, is_wall, segment_reach
 from ct_envs.occupancy import MAP_CELLS
 
-NEVER = 30_000  # more steps ago than any episode has
-
 
 @struct.dataclass
 class Seen:
-    """How many steps ago each cell of the maze was seen last."""
+    """Which cells of the maze have been seen."""
 
-    ago: Int[Array, "N H W"]
+    cells: Bool[Array, "N H W"]
 
 
 @dataclass(frozen=True)
@@ -32,17 +30,16 @@ class ExplorerGuide:
     radius_m: float
     map_cell_m: float
     cell_m: float
-    remember: int = NEVER  # steps after which it forgets a cell that it no longer sees
     look_m: float = 10.0  # farthest waypoint [m]; the controller was trained on edges of this length
 
     def init(self, maze: Maze) -> Seen:
         """Nothing seen yet. ``maze`` has a leading axis N, here and below."""
-        return Seen(jnp.full(maze.walls.shape, NEVER, jnp.int32))
+        return Seen(jnp.zeros(maze.walls.shape, bool))
 
     def waypoint(self, seen: Seen, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]):
         """Targets [N, 2] (m), and what has been seen by now."""
-        seen = Seen(jnp.where(jax.vmap(self._shown)(maze, position), 0, jnp.minimum(seen.ago + 1, NEVER)))
-        believed = maze.replace(walls=maze.walls & (seen.ago < self.remember))
+        seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
+        believed = maze.replace(walls=maze.walls & seen.cells)
         to_go = _distances(believed, goal)
         return jax.vmap(self._choose)(believed, to_go, position, goal), seen
 

@@ -112,8 +112,7 @@ def recover(
     Raises:
         UserError: too few recoveries within ``give_up * T`` episodes, or a ``keep`` that means nothing.
     """
-    name = "shortcut" if collecting.guide == "roadmap" else collecting.guide
-    guide = make_guide(name, env, prm, collecting.remember)
+    guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:

@@ -54,14 +54,12 @@ PUBLISHED = replace(
 )
 """The method as published in everything but size: a model, a memory and a number of updates for two CPU cores."""
 
-_LIFTED = FitConfig(
-    batch=24, steps=80, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True, shift_timestep=300
-)
+_LIFTED = FitConfig(batch=24, steps=80, learning_rate=1e-3, weight_decay=1e-3, warmup=100, mirror=True)
 
 CPU = replace(
     PUBLISHED,
     prm=PrmConfig(margin_m=0.3),
-    collect=CollectConfig(trajectories=1000, guide="explorer", remember=48, starts="maze", noise=0.5),
+    collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
     model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0, actions=False),
     fit=replace(_LIFTED, updates=800),
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
@@ -72,8 +70,8 @@ CPU = replace(
     round_fit=replace(_LIFTED, updates=300, warmup=20),
     last_fit=replace(_LIFTED, updates=2500, warmup=20, decay=True),
 )
-"""What lifts the method on two CPU cores: a teacher that knows, and remembers, no more than its pupil, free starts,
-disturbances, mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
+"""What lifts the method on two CPU cores: a teacher that knows no more than its pupil, free starts, disturbances,
+mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
 
 DEMO = replace(
     CPU,
@@ -177,10 +175,9 @@ def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float
     if not settings.reprompt:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)
-    collect = replace(settings.collect, remember=64)
     fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
     longer = {name: replace(fit, steps=96) for name, fit in fits.items() if fit is not None}
-    return replace(settings, model=model, collect=collect, **longer)
+    return replace(settings, model=model, **longer)
 
 
 TURTLEBOT3_PAPER = Settings(
@@ -262,11 +259,10 @@ def to_dict(settings: Settings) -> dict[str, Any]:
     values = asdict(settings)
     if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
         values.pop("rooms")
-    fits = filter(None, (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit"))))
-    later = [(fit, FitConfig, "precision") for fit in fits]
-    for part, kind, name in (*later, (values["collect"], CollectConfig, "remember")):  # likewise
-        if part[name] == getattr(kind, name):
-            part.pop(name)
+    fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
+    for fit in filter(None, fits):
+        if fit["precision"] == FitConfig.precision:  # likewise
+            fit.pop("precision")
     return values
 
 

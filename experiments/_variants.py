@@ -133,7 +133,7 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
     variants |= {name: published for name in baselines}
     if preset == "cpu":  # likewise without and with fine-tuning
         assert lifted.last_fit is not None
-        variants["cpu-ct"] = replace(lifted, rounds=0, fit=lifted.last_fit)
+        variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
     return Plan(variants, baselines)
 
