@@ -354,6 +354,16 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
     write_json(file, kept)
 
 
+def replace_rows(file: Path, rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Write rows into a results file in place of those that agree with one in these names; returns all of it."""
+    subject = lambda row: tuple(row[name] for name in names)  # noqa: E731
+    anew = set(map(subject, rows))
+    before = read_json(file)["rows"] if file.is_file() else []
+    together = [row for row in before if subject(row) not in anew] + rows
+    write_json(file, {"rows": together})
+    return together
+
+
 def show_results(file: Path) -> None:
     """Print a results file's rows."""
     print_rows([row | {"method": f"{row['variant']}: {row['method']}"} for row in read_json(file)["rows"]])

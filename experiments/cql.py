@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from _variants import RESULTS, plan_for, pt_cql
+from _variants import RESULTS, plan_for, pt_cql, replace_rows
 
-from ct_jax.checkpoint import read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.run import Run, default_mazes, load_mazes
 
@@ -67,13 +66,8 @@ def main(options: Options) -> None:
 
 def keep(rows: list[dict]) -> None:
     """Add rows to the results file in place of those of the same settings, and print them all."""
-    file = RESULTS / "cql.json"
-    subject = lambda row: [row[n] for n in ("robot", "alpha", "target_rate", "reward_scale", "imitation", "updates")]  # noqa: E731
-    before = read_json(file)["rows"] if file.is_file() else []
-    anew = [subject(row) for row in rows]
-    kept = [row for row in before if subject(row) not in anew] + rows
-    write_json(file, {"rows": kept})
     varied = {"a": "alpha", "r": "target_rate", "s": "reward_scale", "i": "imitation", "u": "updates"}
+    kept = replace_rows(RESULTS / "cql.json", rows, ("robot", *varied.values()))
     short = lambda row: " ".join(f"{letter}{row[name]:g}" for letter, name in varied.items())  # noqa: E731
     print_rows([row | {"method": short(row)} for row in kept if row["robot"] == rows[0]["robot"]])
 

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from _variants import RESULTS, digest_of, origin
+from _variants import RESULTS, digest_of, origin, replace_rows
 
 from ct_envs import MazeEnv, UserError, load_maze
-from ct_jax.checkpoint import read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.evaluate import draw_pairs, evaluate
 from ct_jax.model import load_model
@@ -72,16 +71,8 @@ def main(options: Options) -> None:
             before, after = (measure(options, variant, seed, maze) for variant in ("cpu-ct", "cpu"))
             if before["controller"] != after["controller"]:
                 raise UserError(f"the models of seed {seed} were led by different controllers")
-            keep([before, after])
-
-
-def keep(rows: list[dict[str, Any]]) -> None:
-    """Write rows down in place of those of the same models and mazes, and print them."""
-    subject = lambda row: (row["robot"], row["maze"], row["variant"], row["model_seed"])  # noqa: E731
-    kept = read_json(FILE)["rows"] if FILE.is_file() else []
-    anew = set(map(subject, rows))
-    write_json(FILE, {"rows": [row for row in kept if subject(row) not in anew] + rows})
-    print_rows([row | {"method": row["variant"]} for row in rows])
+            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed"))
+            print_rows([row | {"method": row["variant"]} for row in (before, after)])
 
 
 if __name__ == "__main__":

@@ -77,6 +77,7 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path
     plan = Plan(dict.fromkeys(("one", "pt-cql", "sac"), tiny_settings), {"pt-cql": cql, "sac": sac})
     rows = run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path)
     assert [row["method"] for row in rows] == [*["ct", "planner", "explorer"] * 2, *["pt-cql"] * 2, *["sac"] * 2]
+    assert [row["variant"] for row in rows] == [*["one"] * 6, *["pt-cql"] * 2, *["sac"] * 2]
     assert all(row["episodes"] == 4 and row["seed"] == 0 for row in rows)
     monkeypatch.setattr("_variants.train_cql", None)
     assert run_plan("point", plan, preset="tiny", seeds=(0,), out=tmp_path) == rows
