@@ -33,6 +33,7 @@ class Settings:
     last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
     optimism: float = 1.0  # k: ask for k * V (paper, sec. III-C)
     reprompt: bool = False  # never ask for more than V of the present state
+    random_mazes: int = 0  # so many mazes of a generator to collect and recover in, besides the named ones
     episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
     pairs_seed: int = 0  # their seed: not the run's, so that all models meet the same pairs
     rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
@@ -261,6 +262,8 @@ def to_dict(settings: Settings) -> dict[str, Any]:
     values = asdict(settings)
     if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
         values.pop("rooms")
+    if not settings.random_mazes:  # likewise, as below
+        values.pop("random_mazes")
     fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
     for fit in filter(None, fits):
         if fit["precision"] == FitConfig.precision:  # likewise

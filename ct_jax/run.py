@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ct_envs import Maze, MazeEnv, UserError, load_maze, maze_names, stack_mazes
+from ct_envs import Maze, MazeEnv, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
 from ct_envs.robots import Robot, get_robot
 from ct_jax import __version__, devices
@@ -65,8 +65,10 @@ class Run:
 
     @property
     def stacked(self) -> Maze | None:
-        """The training mazes along a leading axis, if it has any."""
-        return stack_mazes(list(self.mazes.values())) if self.mazes else None
+        """The training mazes along a leading axis, if it has any: the named ones, then those of the generator."""
+        if not self.mazes:
+            return None
+        return stack_mazes([*self.mazes.values(), *random_mazes(self.settings.random_mazes)])
 
     def done(self, stage: str) -> dict[str, Any] | None:
         """What the finished stage said of itself; None if it has not finished."""
@@ -183,6 +185,11 @@ def load_mazes(names: tuple[str, ...]) -> dict[str, Maze]:
         name = given if given in maze_names() else Path(given).stem
         _add(mazes, name, load_maze(given), given)
     return mazes
+
+
+def random_mazes(n: int) -> list[Maze]:
+    """The first n training mazes of the generator, the same for all runs; about the size of the paper's."""
+    return [make_maze(random_walls(seed, height=9, width=13, density=0.9)) for seed in range(n)]
 
 
 def join_mazes(seen: dict[str, Maze], unseen: dict[str, Maze]) -> dict[str, Maze]:

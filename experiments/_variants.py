@@ -55,7 +55,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu, mazes-ct, mazes. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -135,7 +135,27 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         assert lifted.last_fit is not None
         variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
+        variants |= _of_many_mazes(lifted)
     return Plan(variants, baselines)
+
+
+def _of_many_mazes(lifted: Settings) -> dict[str, Settings]:
+    """What lifts the method, with data of 100 mazes more; CT and F-CT after as many updates."""
+    assert lifted.last_fit is not None
+    last = replace(lifted.last_fit, shift_timestep=300)
+    fine_tuned = replace(
+        lifted,
+        random_mazes=100,
+        collect=replace(lifted.collect, trajectories=2500, reset_interval=10),
+        fit=replace(last, updates=600, warmup=100, decay=False),
+        rounds=6,
+        round_fit=replace(last, updates=200, decay=False),
+        last_fit=replace(last, updates=2400),
+    )
+    return {
+        "mazes-ct": replace(fine_tuned, rounds=0, fit=replace(last, updates=4000, warmup=100)),
+        "mazes": fine_tuned,
+    }
 
 
 def run_plan(
@@ -191,7 +211,7 @@ def share(source: Run, run: Run) -> None:
             return found if settings.rooms else (*found, *made_of(run, "controller"))
         found = settings.prm, settings.controller, settings.sac, run.seed
         if stage in ("collect", "fit"):
-            found += settings.collect, settings.rooms
+            found += settings.collect, settings.rooms, settings.random_mazes
         return (*found, settings.model, settings.fit, settings.value) if stage == "fit" else found
 
     alike = [stage for stage in (*SHARED, "evaluate") if made_of(source, stage) == made_of(run, stage)]
