@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
 INTERRUPTED = 130
+MAX_RANDOM_MAZES = 10_000
 _stopped = False  # by a signal
 
 ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then cross mazes without one.
@@ -80,6 +81,8 @@ class Train:
     """Maze to train in, by name or text file. By default the paper's, antmaze-large."""
     eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
     """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
+    random_mazes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
+    """Collect trajectories and recoveries in so many random mazes besides; a model of many crosses new ones better."""
     controller: Annotated[str | None, arg(metavar="own|zoo|RUN")] = None
     """Low-level controller: learn one's own (by default; the ant's demo takes zoo), take the one that ships with the
     package, or that of another run."""
@@ -305,6 +308,8 @@ def _train(command: Train) -> None:
     settings = get_preset(command.preset, command.robot)
     if command.controller is not None:
         settings = replace(settings, controller=command.controller)
+    if command.random_mazes is not None:
+        settings = replace(settings, random_mazes=_checked_count(command.random_mazes))
     if settings.controller != "own":
         load_controller(settings.controller, command.robot)  # before a folder is made for it
     run = Run(
@@ -321,6 +326,13 @@ def _train(command: Train) -> None:
     if is_first():
         print_rows(pipeline.results(run.folder))
         print(f"model:  {run.folder / 'model'}\nreport: {report}")
+
+
+def _checked_count(mazes: int) -> int:
+    """Raises UserError for a number of random mazes that means nothing."""
+    if not 0 <= mazes <= MAX_RANDOM_MAZES:
+        raise UserError(f"--random-mazes {mazes}: give a number from 0 to {MAX_RANDOM_MAZES}")
+    return mazes
 
 
 def _check_processes(among: Processes) -> None:
@@ -348,7 +360,8 @@ def _check_in_rooms(command: Train) -> None:
     """Raises UserError for options that mean nothing in rooms, or where PyBullet is missing."""
     from ct_envs.turtlebot3 import load_pybullet
 
-    for name, default in (("maze", ()), ("eval_maze", ()), ("controller", None), ("engine", "auto")):
+    defaults = {"maze": (), "eval_maze": (), "random_mazes": None, "controller": None, "engine": "auto"}
+    for name, default in defaults.items():
         if getattr(command, name) != default:
             option = name.replace("_", "-")
             raise UserError(f"--{option} is not for the {command.robot}, which drives in random rooms; leave it out")

@@ -118,7 +118,9 @@ def recover(
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
         batch_key, run_key = jax.random.split(jax.random.fold_in(key, first))
-        batch = draw_batch(batch_key, env, mazes, collecting, prm, first_maze=first_maze + first // collecting.reset_interval)
+        batch = draw_batch(
+            batch_key, env, mazes, collecting, prm, first_maze=first_maze + first // collecting.reset_interval
+        )
         plan = plan_memory(guide, batch.tables, batch.which, batch.state)
         memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
         state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)

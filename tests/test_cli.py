@@ -134,7 +134,7 @@ def test_version(capsys):
     ("command", "words"),
     [
         ([], ["train", "evaluate", "report", "mazes", "examples:", "ct-jax train point --preset demo"]),
-        (["train"], ["ROBOT", "--preset", "--out", "--seed", "--maze", "--eval-maze", "--engine", "--resume"]),
+        (["train"], ["ROBOT", "--preset", "--out", "--seed", "--maze", "--eval-maze", "--random-mazes", "--resume"]),
         (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
         (
             ["evaluate"],
@@ -183,6 +183,9 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["train", "point", "--seed", "many"], ["--seed", "'many'", "whole number"]),
         (["train", "point", "--seed", "-1"], ["--seed -1", "0 to"]),
         (["train", "point", "--seed", str(2**70)], ["--seed", "0 to"]),
+        (["train", "point", "--random-mazes", "-1"], ["--random-mazes -1", "from 0 to 10000"]),
+        (["train", "point", "--random-mazes", "10001"], ["--random-mazes 10001", "from 0 to 10000"]),
+        (["train", "turtlebot3", "--random-mazes", "5"], ["--random-mazes is not for the turtlebot3", "leave it out"]),
         (["train", "bob"], ["no robot named 'bob'", "point"]),
         (["train", "point", "--preset", "huge"], ["no preset named 'huge'", "cpu, demo", "paper"]),
         (["train", "point", "--engine", "warp"], ["no engine named 'warp'", "auto, mjx, mujoco"]),

@@ -30,10 +30,15 @@ MADE = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created":
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 
+def fits_of(settings):
+    """The trainings of a fine-tuned transformer, first to last."""
+    return [settings.fit, *[settings.round_fit] * (settings.rounds - 1), settings.last_fit]
+
+
 @pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
-    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", "cpu-ct", "cpu"]
+    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", "cpu-ct", "cpu", "mazes-ct", "mazes"]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
@@ -44,6 +49,10 @@ def test_the_methods_of_the_table(robot):
     assert (fct.recover.stuck_steps, fct.recover.bumps) == stuck[robot]
     lifted_ct, lifted = (plan.variants[name] for name in ("cpu-ct", "cpu"))
     assert lifted_ct.rounds == 0 < lifted.rounds and lifted_ct.collect == lifted.collect
+    of_many_ct, of_many = (plan.variants[name] for name in ("mazes-ct", "mazes"))
+    assert of_many_ct.rounds == 0 < of_many.rounds and of_many_ct.collect == of_many.collect
+    assert of_many_ct.random_mazes == of_many.random_mazes > 0
+    assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
 
@@ -119,9 +128,10 @@ def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_p
         "rounds": run("rounds", rounds=2),
         "model": run("model", model=replace(tiny_settings.model, returns=False)),
         "collect": run("collect", collect=replace(tiny_settings.collect, noise=0.1)),
+        "mazes": run("mazes", random_mazes=2),
         "prm": run("prm", prm=replace(tiny_settings.prm, samples=50)),
     }
-    taken = {"rounds": 3, "model": 2, "collect": 1, "prm": 0}
+    taken = {"rounds": 3, "model": 2, "collect": 1, "mazes": 1, "prm": 0}
     for name, other in others.items():
         share(source, other)
         stages = [stage for stage in ("controller", "collect", "fit") if other.done(stage) is not None]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from ct_envs import POINT, MazeEnv, UserError, load_maze, stack_mazes
+from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
 from ct_jax.finetune import RecoverConfig, Supervised, Watching, lie_for_ever, recover
 from ct_jax.policy import TransformerPolicy
@@ -44,6 +44,14 @@ class Blind:
 def recoveries(own, push, seed=0, *, gain=1.0, **options):
     config = replace(CONFIG, **options)
     return recover(jax.random.key(seed), ENV, MAZES, own, push(gain), config, COLLECTING, PRM)
+
+
+def test_rounds_recover_in_different_mazes(push):
+    """Each of three rounds has two roadmaps; of five mazes they must between them see more than two."""
+    mazes = stack_mazes([make_maze(random_walls(seed, height=7, width=7)) for seed in range(5)])
+    config = replace(CONFIG, keep="relabelled", recoveries=1)
+    rounds = [recover(jax.random.key(i), ENV, mazes, Blind(push()), push(), config, COLLECTING, PRM) for i in range(3)]
+    assert len(set(np.concatenate([np.asarray(data.maze) for data in rounds]).tolist())) > 2
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The pipeline: a run's folder, and that whatever stops it, the next one goes on as if nothing had."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -16,13 +17,14 @@ import pytest
 from ct_envs import UserError, load_maze, robots
 from ct_jax import mazes, pipeline
 from ct_jax import run as runs
+from ct_jax import trajectories as storage
 from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
 from ct_jax.model import load_model
 from ct_jax.presets import Settings
 from ct_jax.progress import Bar
-from ct_jax.run import Run, load_mazes, open_run
+from ct_jax.run import Run, load_mazes, maze_text, open_run, random_mazes
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -99,6 +101,28 @@ def test_the_model_is_read_back_as_it_was_made(tiny_run, tiny_settings):
     model = load_model(str(tiny_run.folder))
     assert (model.robot, model.settings, model.made["seed"]) == ("point", tiny_settings, 0)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((model.policy, model.controller)))
+
+
+def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(tiny_settings, tmp_path):
+    collecting = dataclasses.replace(tiny_settings.collect, trajectories=6, reset_interval=2)
+    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, random_mazes=3, collect=collecting))
+    pipeline.train(run)
+    data = storage.load(run.folder / "collect" / "trajectories.npz")
+    assert set(data.maze.tolist()) > {0} and data.maze.max() <= 3
+    walls, cell_m = np.asarray(run.stacked.walls), 4.0
+    for i in range(data.n):
+        column, row = np.floor(data.position[i, : data.length[i]] / cell_m).astype(int).T
+        assert not walls[data.maze[i], row, column].any()
+    assert {row["maze"] for row in pipeline.results(run.folder)} == {"antmaze-umaze"}
+
+
+def test_the_random_mazes_are_always_the_same():
+    """A run's config names their number only."""
+    few, many = random_mazes(2), random_mazes(4)
+    assert all((a.walls == b.walls).all() for a, b in zip(few, many, strict=False))
+    text = "".join(maze_text(maze) for maze in many)
+    assert hashlib.sha256(text.encode()).hexdigest()[:12] == "8b7c1ab2a05e"
+    assert len({maze_text(maze) for maze in random_mazes(100)}) == 100
 
 
 # ------------------------------------------------------------------------------------------------------- resuming

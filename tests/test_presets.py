@@ -16,6 +16,7 @@ ALL = (
     | {f"{name} for the {robot}": get_preset(name, robot) for name in PRESETS for robot in ("ant", "humanoid")}
     | {
         "default": Settings(),
+        "many mazes": Settings(random_mazes=3),
         "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
     }
 )
