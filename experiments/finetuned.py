@@ -1,17 +1,17 @@
 """What fine-tuning adds, on more pairs than a table has: F-CT less CT in unseen mazes, pair by pair.
 
-    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--runs runs/ant] [--maze validation-2]
+    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned mazes] [--runs runs/ant] [--maze validation-2]
 
 In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, of which no table is made.
 
-Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` of ``experiments/ROBOT.py --preset cpu``, led by one
-controller. Both models of a seed meet the same pairs of seed 1; the tables' are of seed 0. Writes
-``experiments/results/finetuned.json``.
+Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or ``mazes-ct-SEED`` and ``mazes-SEED``) of
+``experiments/ROBOT.py --preset cpu``, led by one controller. Both models of a seed meet the same pairs of seed 1; the
+tables' are of seed 0. Writes ``experiments/results/finetuned.json``.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from _variants import RESULTS, digest_of, origin, replace_rows
@@ -33,6 +33,8 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
+    tuned: Literal["cpu", "mazes"] = "cpu"
+    """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
     runs: Path | None = None
@@ -68,7 +70,8 @@ def main(options: Options) -> None:
     prepare_jax()
     for seed in options.seeds:
         for maze in options.maze:
-            before, after = (measure(options, variant, seed, maze) for variant in ("cpu-ct", "cpu"))
+            variants = (f"{options.tuned}-ct", options.tuned)
+            before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before["controller"] != after["controller"]:
                 raise UserError(f"the models of seed {seed} were led by different controllers")
             replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed"))

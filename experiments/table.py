@@ -17,8 +17,14 @@ import numpy as np
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
-FINE_TUNED = {"F-CT": "CT", "F-CT, `cpu`": "CT, `cpu-ct`"}  # and what each was before
-_ORDER = ["CT", "BC-CT", "F-CT", "PT-CQL", "SAC alone", "CT, `cpu-ct`", "F-CT, `cpu`"]
+# What is fine-tuned, and what it was before.
+FINE_TUNED = {
+    "F-CT": "CT",
+    "F-CT, `cpu`": "CT, `cpu-ct`",
+    "F-CT, `mazes`": "CT, `mazes-ct`",
+}
+_ORDER = ["CT", "BC-CT", "F-CT", "PT-CQL", "SAC alone"]
+_ORDER += ["CT, `cpu-ct`", "F-CT, `cpu`", "CT, `mazes-ct`", "F-CT, `mazes`"]
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
@@ -73,7 +79,7 @@ def method_name(row: dict[str, Any]) -> str:
         return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
     if method != "ct":
         return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
-    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT", "cpu": "F-CT, `cpu`"}
+    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT", "cpu": "F-CT, `cpu`", "mazes": "F-CT, `mazes`"}
     return named.get(variant, f"CT, `{variant}`")
 
 
@@ -95,10 +101,14 @@ def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> 
         of_seed = {same(row): flags(row, "success") for row in together.get((seen, maze, untuned), ())}
         changes = [flags(row, "success") - of_seed[same(row)] for row in tuned if same(row) in of_seed]
         if changes:
-            low, high = interval_of_mean(np.stack(changes))
-            mean = 100 * np.mean(changes)
-            lines += [f"{maze}: {name} less {untuned} {mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f}) of 100"]
+            lines += [f"{maze}: {name} less {untuned} {gain_of(changes)} of 100"]
     return ["", "; ".join(lines) + "."] if lines else []
+
+
+def gain_of(changes: list[np.ndarray]) -> str:
+    """The mean of several models' changes, pair by pair, in percent with its interval."""
+    low, high = interval_of_mean(np.stack(changes))
+    return f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
 
 
 def flags(row: dict[str, Any], name: str) -> np.ndarray:
@@ -227,18 +237,17 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def finetuned_table(results: dict[str, Any]) -> list[str]:
-    """One line for each robot and maze: CT, F-CT and what lies between them, of the models of all seeds."""
-    lines = ["| robot | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 7 + "|"]
+    """One line for each robot, F-CT and maze: CT, F-CT and what lies between them, of the models of all seeds."""
+    lines = ["| robot | F-CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 8 + "|"]
     rows = results["rows"]
-    for robot, maze in dict.fromkeys((row["robot"], row["maze"]) for row in rows):
-        here = sorted((r for r in rows if (r["robot"], r["maze"]) == (robot, maze)), key=lambda r: r["model_seed"])
-        before, after = ([r for r in here if r["variant"] == variant] for variant in ("cpu-ct", "cpu"))
+    subject = lambda row: (row["robot"], row["variant"].removesuffix("-ct"), row["maze"])  # noqa: E731
+    for robot, tuned, maze in dict.fromkeys(map(subject, rows)):
+        here = sorted((r for r in rows if subject(r) == (robot, tuned, maze)), key=lambda r: r["model_seed"])
+        before, after = ([r for r in here if r["variant"] == variant] for variant in (f"{tuned}-ct", tuned))
         changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
-        low, high = interval_of_mean(np.stack(changes))
-        gain = f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
         counts = [str(len(before)), str(before[0]["episodes"])]
-        cells = [robot, maze, *counts, pooled(before, "success"), pooled(after, "success"), gain]
-        lines.append("| " + " | ".join(cells) + " |")
+        rates = [pooled(before, "success"), pooled(after, "success")]
+        lines.append("| " + " | ".join([robot, f"`{tuned}`", maze, *counts, *rates, gain_of(changes)]) + " |")
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
     on = f"pairs of seed {rows[0]['seed']}"
     return [*lines, "", f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}."]

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Plan, digest, plan_for, run_plan, share, write_results
 from controllers import described, minutes, table
-from table import differences, interval_of_mean, method_name, pooled, room_table, transfer_table
+from table import differences, finetuned_table, interval_of_mean, method_name, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
 
 from ct_envs import MazeEnv, UserError
@@ -242,6 +242,20 @@ def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
         "ct 10 min (of them, for the planning trajectories: 5.0 to 5.0)."
     )
     assert "ct, 2 models" in lines[2] and any("| 60 | 5 | 5 |" in line for line in lines)
+
+
+def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart():
+    def row(variant, seed, successes):
+        head = {"robot": "point", "maze": "m", "variant": variant, "model_seed": seed, "seed": 1, "episodes": 4}
+        rates = {"success_rate": successes.count("1") / 4, "outcomes": {"success": successes}}
+        return head | rates | MADE | {"trained": MADE}
+
+    one = [row("cpu", 0, "1111"), row("cpu-ct", 0, "0000")]
+    many = [row("mazes-ct", 1, "0011"), row("mazes-ct", 0, "1100"), row("mazes", 0, "1110"), row("mazes", 1, "0110")]
+    lines = [line.split(" | ") for line in finetuned_table({"rows": [*many, *one]})[2:4]]
+    assert [line[1:5] for line in lines] == [["`mazes`", "m", "2", "4"], ["`cpu`", "m", "1", "4"]]
+    assert [line[-1].split()[0] for line in lines] == ["+12.5", "+100.0"]
+    assert finetuned_table({"rows": [*one, *many]})[3] == finetuned_table({"rows": [*many, *one]})[2]  # in any order
 
 
 def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
