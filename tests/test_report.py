@@ -208,6 +208,15 @@ def test_a_run_without_failures_says_so(make_run):
     assert "failures:" not in page.text
 
 
+@pytest.mark.parametrize(("besides", "said"), [(100, True), (0, False), ("many", False), (None, False)])
+def test_random_mazes_are_mentioned(make_run, besides, said):
+    run = make_run()
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["random_mazes"] = besides
+    (run / "config.json").write_text(json.dumps(config))
+    assert ("trained in 100 random mazes besides" in to_html(reading.read_run(run))) == said
+
+
 def test_the_same_run_gives_the_same_page(make_run):
     run = make_run()
     assert read(run)[0] == read(run)[0]

@@ -232,6 +232,10 @@ def _mazes(run: Run) -> str:
         svg = pictures.to_svg(figure, f"{'' if rooms else 'Maze '}{name}, {size}{note}.")
         figures.append(_figure(svg, name, size + note, _seen_tag(run.seen.get(name, False))))
     lead = "The planner knows these maps. The transformer never sees one: only the walls around it."
+    settings = run.config.get("settings")
+    besides = settings.get("random_mazes") if isinstance(settings, dict) else None
+    if isinstance(besides, int) and besides:
+        lead += f" It was trained in {words.count(besides, 'random maze')} besides."
     lead = f'<p class="quiet">{lead}</p>'
     more = len(run.walls) - len(figures)
     rest = f'<p class="quiet">{words.count(more, "further " + ("room" if rooms else "maze"))} not drawn.</p>'
