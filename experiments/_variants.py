@@ -234,7 +234,7 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
     if row["method"] in GUIDED and margin(run) is not None:
         made["margin_m"] = margin(run)
-    if margin(run) is not None:
+    if margin(run) is not None and row["method"] != "sac":  # which nothing led
         where = run.settings.controller
         made["controller"] = controller_digest(str(run.folder) if where == "own" else where, run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}

@@ -95,6 +95,17 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tmp_path
         run_plan("point", other, preset="tiny", seeds=(0,), out=tmp_path)
 
 
+def test_sac_alone_needs_nothing_of_the_method(tiny_settings, tmp_path, monkeypatch):
+    """No controller, no trajectories: its run holds a policy and its rows."""
+    monkeypatch.setattr("_variants.default_mazes", lambda robot: (("antmaze-umaze",), ()))
+    sac = replace(tiny_settings.sac, iterations=4, warmup=1)
+    (row,) = run_plan(
+        "point", Plan({"sac": tiny_settings}, {"sac": sac}), preset="tiny", seeds=(0,), out=tmp_path
+    )  # fmt: skip
+    assert row["method"] == "sac" and "controller" not in row
+    assert not any((tmp_path / "sac-0" / stage).exists() for stage in ("controller", "collect", "fit"))
+
+
 def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeypatch):
     """What keeps away from walls is another planner: it stands beside what was taught by it."""
     plan = Plan({
