@@ -24,8 +24,10 @@ from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
-from ct_jax.transformer import RETURN_SCALE, ControlTransformer, sample_inputs
+from ct_jax.transformer import RETURN_SCALE, ControlTransformer, Modes, sample_inputs
 from ct_jax.value import ValueNetwork
+
+MODE_SPREAD = 0.05  # squared error between actions of one mode; that of actions of two is many times larger
 
 
 @dataclass(frozen=True)
@@ -126,14 +128,20 @@ def _matrices(params: Any) -> Any:
 
 
 def transformer_loss(model: ControlTransformer) -> Loss:
-    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-C)."""
+    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-C).
+
+    Of several modes, minus the logarithm of the likelihood of a mixture of Gaussians around them, scaled such that of a
+    single one the squared error is left.
+    """
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
-        predicted = model.apply(
+        predicted: Modes = model.apply(
             params, window.map, window.proprio, window.goal, window.action, window.rtg, window.timestep, window.valid,
-            deterministic=False, rngs={"dropout": key},
-        )  # fmt: skip
-        error = jnp.mean((predicted - window.target) ** 2, -1)  # pyright: ignore
+            deterministic=False, rngs={"dropout": key}, method="propose",
+        )  # fmt: skip # pyright: ignore
+        error = jnp.mean((predicted.action - window.target[..., None, :]) ** 2, -1)
+        likelihood = jax.nn.log_softmax(predicted.logit) - error / MODE_SPREAD
+        error = -MODE_SPREAD * jax.nn.logsumexp(likelihood, -1)
         return jnp.sum(error * window.learn) / jnp.maximum(jnp.sum(window.learn), 1.0)
 
     return loss

@@ -7,7 +7,7 @@ import numpy as np
 
 from ct_envs import UserError
 
-BODY = ("embed_state", "embed_action", "predict_action", "head")  # modules that depend on the robot
+BODY = ("embed_state", "embed_action", "predict_action", "predict_mode", "head")  # modules that depend on the robot
 
 
 def transfer(source: Any, fresh: Any) -> Any:

@@ -7,7 +7,7 @@ mask, so a window of any number of steps may be trained on.
 
 import functools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -42,6 +42,7 @@ class ModelConfig:
     actions: bool = True  # see its own past actions, as the paper's does; without them, it cannot repeat itself
     frame: str = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
     directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
+    modes: int = 1  # actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it
 
     @property
     def tokens(self) -> int:
@@ -147,17 +148,33 @@ class HeadingHead(nn.Module):
     The same gait then serves every heading, and the trunk need not know which way the body looks.
     """
 
-    directions: int
+    directions: int  # a mode
     action_size: int
+    modes: int = 1
     width: int = 256
 
     @nn.compact
-    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b A"]:
+    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b M A"]:
         heading, own = body_features(proprio)
-        hidden = jnp.concatenate([directions(x, heading, self.directions), own], -1)
+        where = directions(x, heading, self.modes * self.directions)
+        where = where.reshape(*where.shape[:-1], self.modes, -1)
+        own = jnp.broadcast_to(own[..., None, :], (*where.shape[:-1], own.shape[-1]))
+        hidden = jnp.concatenate([where, own], -1)
         for _ in range(2):
             hidden = nn.relu(Dense(self.width)(hidden))
         return Dense(self.action_size)(hidden)
+
+
+class Modes(NamedTuple):
+    """Actions to choose from."""
+
+    action: Float[Array, "*b M A"]
+    logit: Float[Array, "*b M"]  # how likely each is
+
+    def best(self) -> Float[Array, "*b A"]:
+        """The likeliest."""
+        which = jnp.argmax(self.logit, -1)[..., None, None]
+        return jnp.take_along_axis(self.action, which, -2).squeeze(-2)
 
 
 class ControlTransformer(nn.Module):
@@ -187,9 +204,11 @@ class ControlTransformer(nn.Module):
         self.dropout = Dropout(c.dropout)
         self.blocks = [Block(c, self.dtype, self.attention) for _ in range(c.layers)]
         if c.frame == "heading":
-            self.head = HeadingHead(c.directions, self.action_size)
+            self.head = HeadingHead(c.directions, self.action_size, c.modes)
         else:
-            self.predict_action = Dense(self.action_size)
+            self.predict_action = Dense(c.modes * self.action_size)
+        if c.modes > 1:
+            self.predict_mode = Dense(c.modes)
 
     def _embed_time(self, timestep: jax.Array) -> jax.Array:
         """The embedding of the absolute timestep, shared by the tokens of a step."""
@@ -206,12 +225,20 @@ class ControlTransformer(nn.Module):
             proprio = jnp.concatenate(body_features(proprio), -1)
         return self.embed_state(jnp.concatenate([self.encode_map(maps), proprio, goal], -1))
 
-    def _predict(self, x: jax.Array, proprio: jax.Array) -> jax.Array:
+    def _predict(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Modes:
         """Actions from what the trunk makes of state tokens."""
-        x = self.norm_out(x).astype(jnp.float32)
-        return self.head(x, proprio) if self.config.frame == "heading" else self.predict_action(x)
+        x, n = self.norm_out(x).astype(jnp.float32), self.config.modes
+        if self.config.frame == "heading":
+            action = self.head(x, proprio)
+        else:
+            action = self.predict_action(x).reshape(*x.shape[:-1], n, self.action_size)
+        return Modes(action, self.predict_mode(x) if n > 1 else jnp.zeros((*x.shape[:-1], n)))
 
-    def __call__(
+    def __call__(self, *window: Any, **options: Any) -> Float[Array, "B S A"]:
+        """The likeliest of the actions that ``propose`` has for each step."""
+        return self.propose(*window, **options).best()
+
+    def propose(
         self,
         maps: UInt8[Array, "B S 2 k k"],
         proprio: Float[Array, "B S P"],
@@ -223,7 +250,7 @@ class ControlTransformer(nn.Module):
         *,
         context: int | None = None,
         deterministic: bool = True,
-    ) -> Float[Array, "B S A"]:
+    ) -> Modes:
         """Predicted actions of all steps of pieces of S steps. Steps that are not ``valid`` must come last."""
         (batch, steps), n = rtg.shape, self.config.tokens
         tokens = [self._embed_return(rtg), self._embed_state(maps, proprio, goal)]
@@ -270,7 +297,7 @@ class ControlTransformer(nn.Module):
             keys.append(jax.lax.dynamic_update_slice(old_keys, jnp.moveaxis(k, 1, -1), (0, 0, 0, place)))
             values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
             x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
-        action = jnp.clip(self._predict(x[:, -1], proprio), -1.0, 1.0)
+        action = jnp.clip(self._predict(x[:, -1], proprio).best(), -1.0, 1.0)
         return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
 
 

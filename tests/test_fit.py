@@ -1,6 +1,7 @@
 """Supervised training: it learns, it can be stopped and continued, and it is one program on any number of devices."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 from ct_envs import POINT, UserError, load_maze, stack_mazes
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.fit import (
+    MODE_SPREAD,
     Fit,
     FitConfig,
     ValueConfig,
@@ -21,7 +23,7 @@ from ct_jax.fit import (
 )
 from ct_jax.pipeline import make_learner
 from ct_jax.trajectories import sample_windows
-from ct_jax.transformer import ControlTransformer, ModelConfig
+from ct_jax.transformer import ControlTransformer, ModelConfig, Modes
 from ct_jax.value import ValueNetwork
 
 MAZES = stack_mazes([load_maze("antmaze-umaze")])
@@ -160,6 +162,25 @@ def test_what_is_not_to_be_imitated_teaches_nothing(data, params):
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(nothing))
     half = window.replace(learn=0.5 * window.learn)  # a weight of all is no weight
     np.testing.assert_allclose(grad(params, half, jax.random.key(1))[0], shown[0], rtol=1e-5)
+
+
+def test_two_modes_learn_either_way_where_one_learns_neither(data):
+    """Half of the pieces are told left, half right: one mode's best is between them, of two each takes a side."""
+    window = sample_windows(jax.random.key(0), data, data.rtg, MAZES, batch=8, steps=3, map_cell_m=0.8)
+    window = window.replace(target=jnp.where(jnp.arange(8)[:, None, None] < 4, 1.0, -1.0) + 0 * window.target)
+    window = window.replace(learn=jnp.ones_like(window.learn))
+
+    def loss_of(action, logit):
+        model = SimpleNamespace(apply=lambda *inputs, **options: Modes(jnp.asarray(action), jnp.asarray(logit)))
+        return float(transformer_loss(model)({}, window, jax.random.key(0)))
+
+    steps, size = window.rtg.shape, window.target.shape[-1]
+    one = lambda value: loss_of(np.full((*steps, 1, size), value, np.float32), np.zeros((*steps, 1), np.float32))  # noqa: E731
+    assert np.allclose([one(0.0), one(1.0), one(0.5)], [1.0, 2.0, (0.25 + 2.25) / 2], rtol=1e-5)  # the squared error
+    sides = np.broadcast_to(np.array([1.0, -1.0], np.float32)[:, None], (*steps, 2, size))
+    both = loss_of(sides, np.zeros((*steps, 2), np.float32))
+    assert np.isclose(both, MODE_SPREAD * np.log(2), rtol=1e-5)  # right, but for not knowing which
+    assert loss_of(sides, np.broadcast_to(np.array([9.0, 0.0], np.float32), (*steps, 2))) > both
 
 
 def score(data):

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.transformer import ControlTransformer, MapEncoder, ModelConfig, band, empty_cache, sample_inputs
+from ct_jax.transformer import (
+    ControlTransformer,
+    HeadingHead,
+    MapEncoder,
+    ModelConfig,
+    band,
+    empty_cache,
+    sample_inputs,
+)
 
 P, A = 3, 2
 TINY = ModelConfig(layers=1, heads=2, width=16, context=4, context_acting=4, max_timestep=64)
@@ -142,6 +150,39 @@ def test_acting_without_past_actions_is_the_forward_pass(layers, acting):
     piece = episode(layers, steps=21)
     whole = predict(config, piece, context=acting)
     np.testing.assert_allclose(act_along(config, params_of(config), piece), np.clip(whole, -1.0, 1.0), atol=1e-4)
+
+
+def test_of_several_modes_the_likeliest_is_acted():
+    """With the cache as in the forward pass, and not always the same one."""
+    config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
+    params, inputs = params_of(config), [piece[name] for name in INPUTS]
+    modes = jax.jit(lambda p: ControlTransformer(config, A).apply(p, *inputs, method="propose"))(params)
+    assert modes.action.shape == (2, 21, 3, A) and modes.logit.shape == (2, 21, 3)
+    which = np.asarray(modes.logit).argmax(-1)
+    assert len(np.unique(which)) > 1
+    chosen = np.take_along_axis(np.asarray(modes.action), which[..., None, None], 2)[:, :, 0]
+    np.testing.assert_allclose(predict(config, piece), chosen, atol=1e-6)
+    np.testing.assert_allclose(act_along(config, params, piece), np.clip(chosen, -1.0, 1.0), atol=1e-4)
+
+
+def test_with_one_mode_nothing_chooses():
+    assert "predict_mode" not in params_of(TINY)["params"]
+    modes = ControlTransformer(TINY, A).apply(
+        params_of(TINY), *(episode(0)[name] for name in INPUTS), method="propose"
+    )  # fmt: skip
+    np.testing.assert_allclose(modes.action[:, :, 0], predict(TINY, episode(0)), atol=1e-5)
+
+
+def test_each_mode_of_a_robot_with_a_heading_has_directions_of_its_own():
+    """Where the modes' directions change places, their actions do, and nothing else changes."""
+    head = HeadingHead(directions=3, action_size=4, modes=2, width=8)
+    x, proprio = jax.random.normal(jax.random.key(0), (5, 16)), jax.random.normal(jax.random.key(1), (5, 27))
+    params = head.init(jax.random.key(2), x, proprio)
+    swapped = jax.tree.map(lambda leaf: leaf, params)
+    swapped["params"]["Dense_0"] = {name: jnp.roll(p, 2 * 3, -1) for name, p in params["params"]["Dense_0"].items()}
+    before, after = head.apply(params, x, proprio), head.apply(swapped, x, proprio)
+    assert np.abs(before[:, 0] - before[:, 1]).max() > 1e-2
+    np.testing.assert_allclose(after, before[:, ::-1], atol=1e-6)
 
 
 def test_episodes_do_not_see_each_other():
