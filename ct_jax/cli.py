@@ -82,7 +82,7 @@ class Train:
     eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
     """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
     random_mazes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Collect trajectories and recoveries in so many random mazes besides; a model of many crosses new ones better."""
+    """Collect trajectories and recoveries in so many random mazes besides."""
     controller: Annotated[str | None, arg(metavar="own|zoo|RUN")] = None
     """Low-level controller: learn one's own (by default; the ant's demo takes zoo), take the one that ships with the
     package, or that of another run."""

@@ -61,7 +61,7 @@ CPU = replace(
     PUBLISHED,
     prm=PrmConfig(margin_m=0.3),
     collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
-    model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0, actions=False, modes=4),
+    model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0, actions=False),
     fit=replace(_LIFTED, updates=800),
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
     recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=250),

@@ -55,7 +55,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu, mazes-ct, mazes. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu, mazes-ct, mazes, modes-ct, modes. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -136,6 +136,8 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
         variants |= _of_many_mazes(lifted)
+        modes = replace(lifted.model, modes=4)
+        variants |= {f"modes{name}": replace(variants[f"cpu{name}"], model=modes) for name in ("-ct", "")}
     return Plan(variants, baselines)
 
 

@@ -1,10 +1,10 @@
 """What fine-tuning adds, on more pairs than a table has: F-CT less CT in unseen mazes, pair by pair.
 
-    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned mazes] [--runs runs/ant] [--maze validation-2]
+    python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned modes] [--runs runs/ant] [--maze validation-2]
 
 In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, of which no table is made.
 
-Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or ``mazes-ct-SEED`` and ``mazes-SEED``) of
+Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or, as ``--tuned`` says, of another name) of
 ``experiments/ROBOT.py --preset cpu``, led by one controller. Both models of a seed meet the same pairs of seed 1; the
 tables' are of seed 0. Writes ``experiments/results/finetuned.json``.
 """
@@ -33,7 +33,7 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Literal["cpu", "mazes"] = "cpu"
+    tuned: Literal["cpu", "modes", "mazes"] = "cpu"
     """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""

@@ -17,14 +17,10 @@ import numpy as np
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
-# What is fine-tuned, and what it was before.
-FINE_TUNED = {
-    "F-CT": "CT",
-    "F-CT, `cpu`": "CT, `cpu-ct`",
-    "F-CT, `mazes`": "CT, `mazes-ct`",
-}
+_LIFTED = ("cpu", "modes", "mazes")  # variants of F-CT; before fine-tuning, each was the one with "-ct"
+FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
 _ORDER = ["CT", "BC-CT", "F-CT", "PT-CQL", "SAC alone"]
-_ORDER += ["CT, `cpu-ct`", "F-CT, `cpu`", "CT, `mazes-ct`", "F-CT, `mazes`"]
+_ORDER += [name for tuned, before in list(FINE_TUNED.items())[1:] for name in (before, tuned)]
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
@@ -79,7 +75,7 @@ def method_name(row: dict[str, Any]) -> str:
         return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
     if method != "ct":
         return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
-    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT", "cpu": "F-CT, `cpu`", "mazes": "F-CT, `mazes`"}
+    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"} | {name: f"F-CT, `{name}`" for name in _LIFTED}
     return named.get(variant, f"CT, `{variant}`")
 
 

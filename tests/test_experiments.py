@@ -38,7 +38,19 @@ def fits_of(settings):
 @pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
-    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", "cpu-ct", "cpu", "mazes-ct", "mazes"]
+    assert list(plan.variants) == [
+        "published",
+        "bc",
+        "f-ct",
+        "pt-cql",
+        "sac",
+        "cpu-ct",
+        "cpu",
+        "mazes-ct",
+        "mazes",
+        "modes-ct",
+        "modes",
+    ]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
@@ -53,6 +65,8 @@ def test_the_methods_of_the_table(robot):
     assert of_many_ct.rounds == 0 < of_many.rounds and of_many_ct.collect == of_many.collect
     assert of_many_ct.random_mazes == of_many.random_mazes > 0
     assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
+    for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
+        assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.modes > 1
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
 
