@@ -59,7 +59,7 @@ def each_model(rows: list[dict[str, Any]]) -> str:
 def took(rows: list[dict[str, Any]]) -> str:
     """How long the models took, and their trajectories."""
     walls: dict[str, list[float]] = {}
-    for row in rows:
+    for row in (row for row in rows if row["method"] not in ("pt-cql", "sac")):  # whose learning is no stage of a run
         walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
     words = "a model takes: " + ", ".join(f"{name} {np.mean(minutes):.0f} min" for name, minutes in walls.items())
     collecting = [row["collect_wall_s"] / 60 for row in rows if row.get("collect_wall_s")]
