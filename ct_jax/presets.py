@@ -264,8 +264,9 @@ def to_dict(settings: Settings) -> dict[str, Any]:
         values.pop("rooms")
     if not settings.random_mazes:  # likewise, as below
         values.pop("random_mazes")
-    if settings.model.modes == ModelConfig.modes:
-        values["model"].pop("modes")
+    for name in ("modes", "commitment"):
+        if values["model"][name] == getattr(ModelConfig, name):
+            values["model"].pop(name)
     fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
     for fit in filter(None, fits):
         if fit["precision"] == FitConfig.precision:  # likewise

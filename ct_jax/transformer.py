@@ -43,6 +43,7 @@ class ModelConfig:
     frame: str = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
     directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
     modes: int = 1  # actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it
+    commitment: float = 0.0  # when acting, keep to the mode chosen before unless another is e^commitment times likelier
 
     @property
     def tokens(self) -> int:
@@ -66,6 +67,7 @@ class Cache:
     step: Int[Array, "P"]  # step of each token
     now: Int[Array, ""]  # steps taken
     action: Float[Array, "N A"]  # last action
+    mode: Int[Array, "N"]  # which of the modes it was
 
 
 class MapEncoder(nn.Module):
@@ -173,8 +175,11 @@ class Modes(NamedTuple):
 
     def best(self) -> Float[Array, "*b A"]:
         """The likeliest."""
-        which = jnp.argmax(self.logit, -1)[..., None, None]
-        return jnp.take_along_axis(self.action, which, -2).squeeze(-2)
+        return self.take(jnp.argmax(self.logit, -1))
+
+    def take(self, mode: Int[Array, "*b"]) -> Float[Array, "*b A"]:
+        """The action of the given mode of each."""
+        return jnp.take_along_axis(self.action, mode[..., None, None], -2).squeeze(-2)
 
 
 class ControlTransformer(nn.Module):
@@ -297,8 +302,11 @@ class ControlTransformer(nn.Module):
             keys.append(jax.lax.dynamic_update_slice(old_keys, jnp.moveaxis(k, 1, -1), (0, 0, 0, place)))
             values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
             x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
-        action = jnp.clip(self._predict(x[:, -1], proprio).best(), -1.0, 1.0)
-        return action, Cache(tuple(keys), tuple(values), step, t + 1, action)
+        modes = self._predict(x[:, -1], proprio)
+        stay = jnp.where(t > 0, self.config.commitment, 0.0) * jax.nn.one_hot(cache.mode, self.config.modes)
+        mode = jnp.argmax(modes.logit + stay, -1)
+        action = jnp.clip(modes.take(mode), -1.0, 1.0)
+        return action, Cache(tuple(keys), tuple(values), step, t + 1, action, mode)
 
 
 def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
@@ -317,6 +325,7 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
         step=jnp.full(places, _NEVER, jnp.int32),
         now=jnp.zeros((), jnp.int32),
         action=jnp.zeros((n, action_size)),
+        mode=jnp.zeros(n, jnp.int32),
     )
 
 

@@ -136,8 +136,10 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
         variants |= _of_many_mazes(lifted)
-        modes = replace(lifted.model, modes=4)
-        variants |= {f"modes{name}": replace(variants[f"cpu{name}"], model=modes) for name in ("-ct", "")}
+        # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
+        for name, commitment in (("-ct", 0.0), ("", 3.0)):
+            model = replace(lifted.model, modes=4, commitment=commitment)
+            variants[f"modes{name}"] = replace(variants[f"cpu{name}"], model=model)
     return Plan(variants, baselines)
 
 

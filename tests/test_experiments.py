@@ -67,6 +67,7 @@ def test_the_methods_of_the_table(robot):
     assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.modes > 1
+    assert plan.variants["modes"].model.commitment > plan.variants["modes-ct"].model.commitment == 0.0
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
 

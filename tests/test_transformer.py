@@ -165,6 +165,25 @@ def test_of_several_modes_the_likeliest_is_acted():
     np.testing.assert_allclose(act_along(config, params, piece), np.clip(chosen, -1.0, 1.0), atol=1e-4)
 
 
+def test_committed_it_keeps_to_a_mode_unless_another_is_much_likelier():
+    """By hand from the logits of a forward pass; and where nothing else counts, for ever to the first choice."""
+    config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
+    params, inputs = params_of(config), [piece[name] for name in INPUTS]
+    modes = jax.jit(lambda p: ControlTransformer(config, A).apply(p, *inputs, method="propose"))(params)
+    logit, kept = np.asarray(modes.logit), []
+    commitment = float(np.quantile(np.diff(np.sort(logit, -1), axis=-1), 0.1))  # enough for some, too little for others
+    mode = logit[:, 0].argmax(-1)
+    for t in range(21):
+        mode = (logit[:, t] + commitment * (np.arange(3) == mode[:, None]) * (t > 0)).argmax(-1)
+        kept.append(mode)
+    kept = np.stack(kept, 1)
+    assert len(np.unique(kept)) > 1 and (kept != logit.argmax(-1)).any()
+    for c, which in ((commitment, kept), (1e6, np.broadcast_to(kept[:, :1], kept.shape))):
+        chosen = np.take_along_axis(np.asarray(modes.action), which[..., None, None], 2)[:, :, 0]
+        acted = act_along(replace(config, commitment=c), params, piece)
+        np.testing.assert_allclose(acted, np.clip(chosen, -1.0, 1.0), atol=1e-4)
+
+
 def test_with_one_mode_nothing_chooses():
     assert "predict_mode" not in params_of(TINY)["params"]
     modes = ControlTransformer(TINY, A).apply(
