@@ -257,21 +257,21 @@ def get_preset(name: str, robot: str = "point") -> Settings:
     return presets[name]
 
 
+# Settings that came later, with what was before them: left out where they say just that, so that a run of then goes on.
+_LATER = {"rooms": None, "random_mazes": 0, "modes": 1, "commitment": 0.0, "precision": "float32"}
+
+
 def to_dict(settings: Settings) -> dict[str, Any]:
     """The settings as JSON holds them."""
-    values = asdict(settings)
-    if settings.rooms is None:  # so that a run in mazes continues as what it was before there were rooms
-        values.pop("rooms")
-    if not settings.random_mazes:  # likewise, as below
-        values.pop("random_mazes")
-    for name in ("modes", "commitment"):
-        if values["model"][name] == getattr(ModelConfig, name):
-            values["model"].pop(name)
-    fits = (values["value"]["fit"], *(values[name] for name in ("fit", "round_fit", "last_fit")))
-    for fit in filter(None, fits):
-        if fit["precision"] == FitConfig.precision:  # likewise
-            fit.pop("precision")
-    return values
+    return _without_later(asdict(settings))
+
+
+def _without_later(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: _without_later(value) if isinstance(value, dict) else value
+        for name, value in values.items()
+        if name not in _LATER or value != _LATER[name]
+    }
 
 
 def from_dict(values: dict[str, Any]) -> Settings:

@@ -1,7 +1,7 @@
 """Settings: what a run writes down is what it was."""
 
 import json
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 
 import pytest
 
@@ -9,7 +9,8 @@ from ct_envs import UserError
 from ct_jax.collect import GUIDES
 from ct_jax.finetune import KEEP
 from ct_jax.fit import FitConfig
-from ct_jax.presets import PRESETS, Settings, from_dict, get_preset, to_dict
+from ct_jax.presets import _LATER, PRESETS, Settings, from_dict, get_preset, to_dict
+from ct_jax.transformer import ModelConfig
 
 ALL = (
     PRESETS
@@ -17,6 +18,7 @@ ALL = (
     | {
         "default": Settings(),
         "many mazes": Settings(random_mazes=3),
+        "modes": Settings(model=ModelConfig(modes=4, commitment=3.0)),
         "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
     }
 )
@@ -28,6 +30,14 @@ def test_settings_survive_being_written(name):
     again = from_dict(json.loads(json.dumps(to_dict(settings))))
     assert again == settings
     assert hash(again) == hash(settings)
+
+
+def test_settings_that_came_later_are_written_only_where_they_say_something():
+    """So that a run of before goes on; and what is left out means the default."""
+    words = json.dumps(to_dict(Settings()))
+    assert not [name for name in _LATER if f'"{name}"' in words]
+    words = json.dumps(asdict(Settings()))
+    assert all(f'"{name}": {json.dumps(value)}' in words for name, value in _LATER.items())
 
 
 def test_an_unknown_preset_lists_the_known():
