@@ -145,7 +145,7 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
             ax.fill_between(marks, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
         ax.set(xscale="log", xlabel="updates", title=robot, ylim=(0, 100), xticks=marks, xticklabels=map(str, marks))
         ax.minorticks_off()
-        ax.legend(loc="lower right", frameon=False)
+        ax.legend(loc="best", frameon=False)
     axes[0].set_ylabel("success in the unseen maze [%]")
     figure.savefig(file, dpi=150)
 
