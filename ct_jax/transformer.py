@@ -67,7 +67,7 @@ class Cache:
     step: Int[Array, "P"]  # step of each token
     now: Int[Array, ""]  # steps taken
     action: Float[Array, "N A"]  # last action
-    mode: Int[Array, "N"]  # which of the modes it was
+    mode: Int[Array, "N"]  # which of the modes it was; -1, which is none of them, before the first
 
 
 class MapEncoder(nn.Module):
@@ -303,7 +303,7 @@ class ControlTransformer(nn.Module):
             values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
             x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
         modes = self._predict(x[:, -1], proprio)
-        stay = jnp.where(t > 0, self.config.commitment, 0.0) * jax.nn.one_hot(cache.mode, self.config.modes)
+        stay = self.config.commitment * jax.nn.one_hot(cache.mode, self.config.modes)
         mode = jnp.argmax(modes.logit + stay, -1)
         action = jnp.clip(modes.take(mode), -1.0, 1.0)
         return action, Cache(tuple(keys), tuple(values), step, t + 1, action, mode)
@@ -325,7 +325,7 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
         step=jnp.full(places, _NEVER, jnp.int32),
         now=jnp.zeros((), jnp.int32),
         action=jnp.zeros((n, action_size)),
-        mode=jnp.zeros(n, jnp.int32),
+        mode=jnp.full(n, -1, jnp.int32),
     )
 
 

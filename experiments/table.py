@@ -19,7 +19,8 @@ from ct_jax.evaluate import GUIDED, wilson_of
 ROOT = Path(__file__).parents[1]
 _LIFTED = ("cpu", "modes", "mazes")  # variants of F-CT; before fine-tuning, each was the one with "-ct"
 FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
-_ORDER = ["CT", "BC-CT", "F-CT", "PT-CQL", "SAC alone"]
+_BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
+_ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]
 _ORDER += [name for tuned, before in list(FINE_TUNED.items())[1:] for name in (before, tuned)]
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
@@ -59,7 +60,7 @@ def each_model(rows: list[dict[str, Any]]) -> str:
 def took(rows: list[dict[str, Any]]) -> str:
     """How long the models took, and their trajectories."""
     walls: dict[str, list[float]] = {}
-    for row in (row for row in rows if row["method"] not in ("pt-cql", "sac")):  # whose learning is no stage of a run
+    for row in (row for row in rows if row["method"] not in _BASELINES):  # whose learning is no stage of a run
         walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
     words = "a model takes: " + ", ".join(f"{name} {np.mean(minutes):.0f} min" for name, minutes in walls.items())
     collecting = [row["collect_wall_s"] / 60 for row in rows if row.get("collect_wall_s")]
@@ -74,7 +75,7 @@ def method_name(row: dict[str, Any]) -> str:
     if method in GUIDED:
         return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
     if method != "ct":
-        return {"pt-cql": "PT-CQL", "sac": "SAC alone"}.get(method, method)
+        return _BASELINES.get(method, method)
     named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"} | {name: f"F-CT, `{name}`" for name in _LIFTED}
     return named.get(variant, f"CT, `{variant}`")
 

@@ -152,24 +152,32 @@ def test_acting_without_past_actions_is_the_forward_pass(layers, acting):
     np.testing.assert_allclose(act_along(config, params_of(config), piece), np.clip(whole, -1.0, 1.0), atol=1e-4)
 
 
-def test_of_several_modes_the_likeliest_is_acted():
-    """With the cache as in the forward pass, and not always the same one."""
+def three_modes():
+    """A model of three modes, a piece, and what it proposes at each of its steps."""
     config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
     params, inputs = params_of(config), [piece[name] for name in INPUTS]
     modes = jax.jit(lambda p: ControlTransformer(config, A).apply(p, *inputs, method="propose"))(params)
+    return config, params, piece, modes
+
+
+def actions_of(modes, which):
+    return np.take_along_axis(np.asarray(modes.action), which[..., None, None], 2)[:, :, 0]
+
+
+def test_of_several_modes_the_likeliest_is_acted():
+    """With the cache as in the forward pass, and not always the same one."""
+    config, params, piece, modes = three_modes()
     assert modes.action.shape == (2, 21, 3, A) and modes.logit.shape == (2, 21, 3)
     which = np.asarray(modes.logit).argmax(-1)
     assert len(np.unique(which)) > 1
-    chosen = np.take_along_axis(np.asarray(modes.action), which[..., None, None], 2)[:, :, 0]
+    chosen = actions_of(modes, which)
     np.testing.assert_allclose(predict(config, piece), chosen, atol=1e-6)
     np.testing.assert_allclose(act_along(config, params, piece), np.clip(chosen, -1.0, 1.0), atol=1e-4)
 
 
 def test_committed_it_keeps_to_a_mode_unless_another_is_much_likelier():
     """By hand from the logits of a forward pass; and where nothing else counts, for ever to the first choice."""
-    config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
-    params, inputs = params_of(config), [piece[name] for name in INPUTS]
-    modes = jax.jit(lambda p: ControlTransformer(config, A).apply(p, *inputs, method="propose"))(params)
+    config, params, piece, modes = three_modes()
     logit, kept = np.asarray(modes.logit), []
     commitment = float(np.quantile(np.diff(np.sort(logit, -1), axis=-1), 0.1))  # enough for some, too little for others
     mode = logit[:, 0].argmax(-1)
@@ -179,9 +187,8 @@ def test_committed_it_keeps_to_a_mode_unless_another_is_much_likelier():
     kept = np.stack(kept, 1)
     assert len(np.unique(kept)) > 1 and (kept != logit.argmax(-1)).any()
     for c, which in ((commitment, kept), (1e6, np.broadcast_to(kept[:, :1], kept.shape))):
-        chosen = np.take_along_axis(np.asarray(modes.action), which[..., None, None], 2)[:, :, 0]
         acted = act_along(replace(config, commitment=c), params, piece)
-        np.testing.assert_allclose(acted, np.clip(chosen, -1.0, 1.0), atol=1e-4)
+        np.testing.assert_allclose(acted, np.clip(actions_of(modes, which), -1.0, 1.0), atol=1e-4)
 
 
 def test_with_one_mode_nothing_chooses():
