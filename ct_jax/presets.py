@@ -114,15 +114,15 @@ _ANT_SAC = SacConfig(
 
 
 _HUMANOID_SAC = SacConfig(
-    envs=128,
-    iterations=100_000,
-    updates=4,
-    warmup=30,
+    envs=64,
+    iterations=40_000,
+    updates=8,
+    warmup=60,
     final_rate=0.1,
     average=0.9995,
     critic_norm=True,
-    hidden=(512, 512),  # paper
-    discount=0.99,
+    hidden=(256, 256),  # paper: 512, of which a core makes a quarter of the updates
+    discount=0.98,
     alive_bonus=1.0,
     speed_mps=2.0,
     action_cost=0.2,
@@ -137,11 +137,13 @@ _HUMANOID_SAC = SacConfig(
     relabel=0.25,
     chain=True,
     through=True,
-    turn_ramp=(0.03, 0.15),
+    turn_ramp=(0.1, 0.3),
 )
 
-_HUMANOID_SAC_GPU = replace(_HUMANOID_SAC, envs=512, iterations=22_000, updates=8, batch=2048, replay=1_500_000)
-"""Four times the environments and eight times the batch, for a GPU."""
+_HUMANOID_SAC_GPU = replace(
+    _HUMANOID_SAC, envs=512, iterations=22_000, batch=2048, replay=1_500_000, hidden=(512, 512)
+)
+"""The paper's width, eight times the environments and eight times the batch, for a GPU."""
 
 
 def _for_ant(settings: Settings) -> Settings:
