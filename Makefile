@@ -65,7 +65,7 @@ lock: ## Remake requirements.lock (needs Python 3.11 on Linux x86-64)
 	@echo "Resolving requirements.lock (versions already in it are kept; UPGRADE=--upgrade renews them)"
 	@CUSTOM_COMPILE_COMMAND="make lock" .make/lock/bin/pip-compile --quiet $(UPGRADE) \
 	    --generate-hashes --strip-extras --allow-unsafe --no-emit-options \
-	    --extra dev --extra turtlebot3 --build-deps-for editable --constraint .ci/constraints.txt \
+	    --extra dev --extra turtlebot3 --extra video --build-deps-for editable --constraint .ci/constraints.txt \
 	    --output-file requirements.lock pyproject.toml
 
 clean: ## Remove .venv, builds and caches (runs/ stays)

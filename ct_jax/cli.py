@@ -102,6 +102,7 @@ class Evaluate:
       ct-jax evaluate runs/demo --maze my_floor.txt --episodes 20
       ct-jax evaluate runs/demo --method explorer --json > explorer.json
       ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
+      ct-jax evaluate zoo:ant --maze unseen-rooms --episodes 1 --seed 3 --video rooms.mp4
       ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
       ct-jax evaluate zoo:point --seed 7 --optimism 0.75
     """
@@ -131,6 +132,8 @@ class Evaluate:
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
     picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Draw all episodes in the maze: a .png, .svg or .pdf file."""
+    video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Film the first episode in the maze: an .mp4 file."""
     json: FlagCreatePairsOff[bool] = False
     """Print one JSON object and nothing else."""
     among: Annotated[Processes, arg(name="")] = Processes()
@@ -375,7 +378,7 @@ def _evaluate(command: Evaluate) -> None:
         from ct_jax import pipeline
         from ct_jax.devices import is_first
 
-        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "optimism", "picture")
+        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "optimism", "picture", "video")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
     if not is_first():

@@ -50,6 +50,7 @@ class Episodes:
     pairs: Pairs
     wall_s: float
     asked: np.ndarray | None = None  # return asked for at the start
+    film: np.ndarray | None = None  # float32 [T, nq]: ``qpos`` before each step, of the first episode, for a video
     frontal: np.ndarray | None = None  # bool [n]: ran into something, where that is told from ...
     grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
 
@@ -155,11 +156,11 @@ def evaluate(
         actor = Guided(controller, guide)
         memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
     state, _, steps = run_episodes(env, actor, state, memory, key, chunk=50, limit=env.horizon, on_progress=on_progress)
-    return _outcome(env.horizon, state, steps, pairs, time.perf_counter() - begun, asked)
+    return _outcome(env, state, steps, pairs, time.perf_counter() - begun, asked)
 
 
 def _outcome(
-    horizon: int, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: jax.Array | None
+    env: MazeEnv, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: jax.Array | None
 ) -> Episodes:
     """What happened to the pairs, from the steps of each process's own."""
     names = ("success", "fall", "position")
@@ -167,7 +168,7 @@ def _outcome(
     success, fell = end["success"] > 0, end["fall"] > 0
     alive, path = steps.alive, steps.position
     whole = np.concatenate([path, end["position"][None]])
-    lying = fell * end["reward"] * (horizon - alive.sum(0))
+    lying = fell * end["reward"] * (env.horizon - alive.sum(0))
     each = {
         "success": success,
         "collided": (steps.collision * alive).sum(0) > 0,
@@ -181,4 +182,6 @@ def _outcome(
     n = len(pairs.start)
     each = {name: None if rows is None else joined(rows)[:n] for name, rows in each.items()}
     every_path = joined(np.swapaxes(path, 0, 1))[:n]
-    return Episodes(**each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s)
+    rest = env.engine.model.nq - 2  # of qpos, with which proprioception begins
+    film = joined(np.concatenate([path[:, 0], steps.proprio[:, 0, :rest]], -1)[None])[0]
+    return Episodes(**each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s, film=film)

@@ -147,21 +147,26 @@ def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
 
 def evaluate_in_maze(
     model: TrainedModel, method: str, seed: int, *, maze: str = "antmaze-large", episodes: int = 100,
-    engine: str = "auto", picture: Path | None = None,
+    engine: str = "auto", picture: Path | None = None, video: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in one maze; returns its row of the table.
 
     Args:
         picture: file for a picture of all episodes.
+        video: file for a video of the first one.
 
     Raises:
-        UserError: unknown maze, no episodes, or a picture that cannot be made there.
+        UserError: unknown maze, no episodes, or a picture or video that cannot be made there.
     """
     if picture is not None and (picture.suffix not in PICTURES or not picture.parent.is_dir()):
         raise UserError(f"--picture {picture}: give a {', '.join(PICTURES)} file in a folder that exists")
     if not 1 <= episodes <= MAX_EPISODES:
         raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
     world = load_maze(maze)
+    if video is not None:
+        from ct_jax.report.video import check_video, write_video  # likewise
+
+        check_video(video)
     env = MazeEnv(model.robot, engine=engine, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
     robot = env.robot
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
@@ -173,4 +178,8 @@ def evaluate_in_maze(
 
         reached = f"{int(outcome.success.sum())} of {len(outcome.success)} reached the goal"
         pictures.write_paths(picture, unpadded(world), outcome, f"{model.robot}, {method} in {name}: {reached}")
+    if video is not None and devices.is_first():
+        assert outcome.film is not None
+        film = outcome.film[: int(outcome.steps[0])]
+        write_video(video, robot, world, film, pairs.goal[0], f"{model.robot}, {method} in {name}")
     return row

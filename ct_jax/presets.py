@@ -140,9 +140,7 @@ _HUMANOID_SAC = SacConfig(
     turn_ramp=(0.1, 0.3),
 )
 
-_HUMANOID_SAC_GPU = replace(
-    _HUMANOID_SAC, envs=512, iterations=22_000, batch=2048, replay=1_500_000, hidden=(512, 512)
-)
+_HUMANOID_SAC_GPU = replace(_HUMANOID_SAC, envs=512, iterations=22_000, batch=2048, replay=1_500_000, hidden=(512, 512))
 """The paper's width, eight times the environments and eight times the batch, for a GPU."""
 
 

@@ -204,6 +204,7 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--optimism", "0.5", "--method", "explorer"], ["--optimism", "--method ct"]),
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
+        (["evaluate", "RUN", "--video", "walk.gif"], ["--video walk.gif", ".mp4"]),
         (["evaluate", "zoo:nobody"], ["zoo:nobody", "models: zoo:"]),
         (["evaluate", "nowhere"], ["nowhere: no run folder", "ct-jax train"]),
         (["report", "nowhere"], ["nowhere"]),

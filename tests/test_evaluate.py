@@ -168,6 +168,7 @@ def test_what_is_reported_is_what_happened(push):
     assert -done.returns[0] == pytest.approx(away.sum(), abs=POINT.goal_tolerance_m)
     assert done.travelled_m[0] == pytest.approx(5.5, abs=0.5)
     assert done.summary()["spl"] <= 1
+    np.testing.assert_array_equal(done.film, path[:, 0])  # a point's coordinates are its position
 
     blind = evaluate(env, maze, two, "planner", controller=push(0.0))
     np.testing.assert_array_equal(blind.success, False)
