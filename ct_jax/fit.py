@@ -38,7 +38,7 @@ class FitConfig:
 
     updates: int = 75_000
     batch: int = 64  # pieces of trajectories
-    steps: int = 50  # steps of a piece; with more than K, pieces share their past
+    steps: int = 50  # steps of a piece, ``ModelConfig.stride`` apart; with more than K, pieces share their past
     learning_rate: float = 4e-4
     weight_decay: float = 1e-3
     warmup: int = 10_000  # updates of linear warm-up
@@ -75,8 +75,12 @@ Loss = Callable[[Any, Window, jax.Array], jax.Array]
 class Fit:
     """A learner by gradient descent on windows of trajectories: ``create`` and ``train``, both pure."""
 
-    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float, robot: Robot):
-        self.loss, self.config, self.map_cell_m = loss, config, map_cell_m
+    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float, robot: Robot, *, stride: int = 1):
+        """
+        Args:
+            stride: from one step of a piece to the next.
+        """
+        self.loss, self.config, self.map_cell_m, self.stride = loss, config, map_cell_m, stride
         self._symmetries = symmetries(robot) if config.mirror else None
         if config.decay:
             rate = optax.warmup_cosine_decay_schedule(
@@ -113,6 +117,7 @@ class Fit:
                 map_cell_m=self.map_cell_m,
                 symmetries=self._symmetries,
                 shift_timestep=self.config.shift_timestep,
+                stride=self.stride,
             )
             window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
             loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)

@@ -175,10 +175,9 @@ def _fit_both(
 def make_learner(model: ControlTransformer | ValueNetwork, config: FitConfig, map_cell_m: float, robot: Robot) -> Fit:
     """One learner, and so one compilation, for all rounds that train alike."""
     if isinstance(model, ValueNetwork):
-        loss = value_loss(model)
-    else:
-        loss = transformer_loss(model.clone(dtype=None if config.precision == "float32" else config.precision))
-    return Fit(loss, config, map_cell_m, robot)
+        return Fit(value_loss(model), config, map_cell_m, robot)
+    loss = transformer_loss(model.clone(dtype=None if config.precision == "float32" else config.precision))
+    return Fit(loss, config, map_cell_m, robot, stride=model.config.stride)
 
 
 def _fit_network(

@@ -183,6 +183,7 @@ def sample_windows(
     symmetries: Symmetries | None = None,
     shift_timestep: int = 0,
     overhang: int = 0,
+    stride: int = 1,
 ) -> Window:
     """Draw pieces of ``steps`` steps: a trajectory by its length, and of it no step less often than another.
 
@@ -192,17 +193,21 @@ def sample_windows(
         symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
         shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
+        stride: from one step of a piece to the next.
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
+    # Of a trajectory, the steps from one of the first few on by strides are one to draw from.
+    origin = jax.random.randint(jax.random.fold_in(where_key, 1), (batch,), 0, jnp.minimum(stride, length))
+    count = (length - origin + stride - 1) // stride
     # Pieces may begin at any step that leaves them full, or at the start of a short trajectory. Those that would hang
     # over an end are moved inside: else first and last steps would be in one piece of many that hold a middle one.
-    last, beyond = jnp.maximum(length + overhang - steps, 0), steps - 1 - overhang
+    last, beyond = jnp.maximum(count + overhang - steps, 0), steps - 1 - overhang
     drawn = jax.random.uniform(where_key, (batch,)) * (last + 1 + 2 * beyond)
     first = jnp.clip(drawn.astype(jnp.int32) - beyond, 0, last)
-    at = first[:, None] + jnp.arange(steps)[None]
+    at = origin[:, None] + stride * (first[:, None] + jnp.arange(steps)[None])
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731

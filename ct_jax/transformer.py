@@ -2,7 +2,8 @@
 
 The policy is defined as *banded* causal attention: a token of step t attends to tokens of steps t - K + 1 ... t that
 come before it. That is what acting with a key/value cache over a sliding window computes, and training uses the same
-mask, so a window of any number of steps may be trained on.
+mask, so a window of any number of steps may be trained on. With a ``stride`` of s it attends to steps t, t - s, t - 2s
+and so on, K of them: s times the memory at the cost of one.
 """
 
 import functools
@@ -44,6 +45,7 @@ class ModelConfig:
     directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
     modes: int = 1  # actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it
     commitment: float = 0.0  # when acting, keep to the mode chosen before unless another is e^commitment times likelier
+    stride: int = 1  # control steps from one step of the memory to the next (paper: 1)
 
     @property
     def tokens(self) -> int:
@@ -59,14 +61,15 @@ class Cache:
     """Keys and values of the last steps of N episodes, a ring of K + 1 places for the tokens (a_{t-1},) R_t, s_t.
 
     One place more than K: the last action still sees K steps back from its own. The places come last, as XLA's matrix
-    products on CPU want them: otherwise each step would transpose the whole cache.
+    products on CPU want them: otherwise each step would transpose the whole cache. With a stride of S there are as many
+    memories, which take turns: each holds every S-th step, and none knows of the others.
     """
 
-    keys: tuple[Float[Array, "N H D P"], ...]  # one array a layer
-    values: tuple[Float[Array, "N H D P"], ...]
-    step: Int[Array, "P"]  # step of each token
-    now: Int[Array, ""]  # steps taken
-    action: Float[Array, "N A"]  # last action
+    keys: tuple[Float[Array, "N S H D P"], ...]  # one array a layer
+    values: tuple[Float[Array, "N S H D P"], ...]
+    step: Int[Array, "S P"]  # step of each token, as its memory counts
+    now: Int[Array, ""]  # steps taken, of all memories
+    action: Float[Array, "N S A"]  # last action of each memory
     mode: Int[Array, "N"]  # which of the modes it was; -1, which is none of them, before the first
 
 
@@ -282,16 +285,20 @@ class ControlTransformer(nn.Module):
         rtg: Float[Array, "N"],
     ) -> tuple[Float[Array, "N A"], Cache]:
         """The next action of N episodes, computing only the tokens that are new: a_{t-1}, R_t and s_t."""
-        t, n = cache.now, self.config.tokens
-        now = self._embed_time(t)[None]
+        n, stride = self.config.tokens, self.config.stride
+        t, which = cache.now // stride, cache.now % stride  # steps of the memory whose turn it is, and which that is
+        mine = functools.partial(jax.lax.dynamic_index_in_dim, index=which, keepdims=False)
+        now = self._embed_time(cache.now)[None]
         tokens, steps = [self._embed_return(rtg) + now, self._embed_state(maps, proprio, goal) + now], [t, t]
         if self.config.actions:
-            tokens.insert(0, self.embed_action(cache.action) + self._embed_time(t - 1)[None])
+            before = self._embed_time(cache.now - stride)[None]
+            tokens.insert(0, self.embed_action(mine(cache.action, axis=1)) + before)
             # The first step has no action before it: its token is said to be of a step that no query reaches.
             steps.insert(0, jnp.where(t > 0, t - 1, _NEVER))
         x, step_of = self.norm_in(jnp.stack(tokens, 1)), jnp.stack(steps)
-        place = t % (cache.step.shape[0] // n) * n
-        step = jax.lax.dynamic_update_slice(cache.step, step_of, (place,))
+        place = t % (cache.step.shape[-1] // n) * n
+        all_steps = jax.lax.dynamic_update_slice(cache.step, step_of[None], (which, place))
+        step = mine(all_steps, axis=0)
         order = jnp.arange(n)
         later = jnp.zeros_like(step).at[place + order].set(order)  # of the new tokens, none sees a later one
         mask = band(step_of, step, self.config.context_acting) & (later[None, :] <= order[:, None])
@@ -299,14 +306,17 @@ class ControlTransformer(nn.Module):
         keys, values = [], []
         for block, old_keys, old_values in zip(self.blocks, cache.keys, cache.values, strict=True):
             q, k, v = block.heads(x)
-            keys.append(jax.lax.dynamic_update_slice(old_keys, jnp.moveaxis(k, 1, -1), (0, 0, 0, place)))
-            values.append(jax.lax.dynamic_update_slice(old_values, jnp.moveaxis(v, 1, -1), (0, 0, 0, place)))
-            x = block.attend(x, q, jnp.moveaxis(keys[-1], -1, 1), jnp.moveaxis(values[-1], -1, 1), mask, True)
+            for new, old, kept in ((k, old_keys, keys), (v, old_values, values)):
+                at = (0, which, 0, 0, place)
+                kept.append(jax.lax.dynamic_update_slice(old, jnp.moveaxis(new, 1, -1)[:, None], at))
+            seen_k, seen_v = (jnp.moveaxis(mine(kept[-1], axis=1), -1, 1) for kept in (keys, values))
+            x = block.attend(x, q, seen_k, seen_v, mask, True)
         modes = self._predict(x[:, -1], proprio)
         stay = self.config.commitment * jax.nn.one_hot(cache.mode, self.config.modes)
         mode = jnp.argmax(modes.logit + stay, -1)
         action = jnp.clip(modes.take(mode), -1.0, 1.0)
-        return action, Cache(tuple(keys), tuple(values), step, t + 1, action, mode)
+        actions = jax.lax.dynamic_update_slice(cache.action, action[:, None], (0, which, 0))
+        return action, Cache(tuple(keys), tuple(values), all_steps, cache.now + 1, actions, mode)
 
 
 def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
@@ -318,13 +328,13 @@ def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Arr
 def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
     """The cache before the first step of N episodes."""
     places = config.tokens * (config.context_acting + 1)
-    empty = jnp.zeros((n, config.heads, config.width // config.heads, places))
+    empty = jnp.zeros((n, config.stride, config.heads, config.width // config.heads, places))
     return Cache(
         keys=(empty,) * config.layers,
         values=(empty,) * config.layers,
-        step=jnp.full(places, _NEVER, jnp.int32),
+        step=jnp.full((config.stride, places), _NEVER, jnp.int32),
         now=jnp.zeros((), jnp.int32),
-        action=jnp.zeros((n, action_size)),
+        action=jnp.zeros((n, config.stride, action_size)),
         mode=jnp.full(n, -1, jnp.int32),
     )
 

@@ -21,11 +21,12 @@ from matplotlib.figure import Figure
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
 from ct_envs.maze import make_maze, parse_walls
+from ct_jax import pipeline
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import draw_pairs, evaluate
-from ct_jax.fit import Fit, fit, init_params, transformer_loss
+from ct_jax.fit import Fit, fit, init_params
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.progress import Bar
 from ct_jax.run import provenance
@@ -72,7 +73,7 @@ class Target:
         settings = model.settings
         config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
         env = MazeEnv(model.robot, map_cell_m=settings.model.map_cell_m, auto_reset=False)
-        learner = Fit(transformer_loss(model.policy.model), config, settings.model.map_cell_m, env.robot)
+        learner = pipeline.make_learner(model.policy.model, config, settings.model.map_cell_m, env.robot)
         made = read_json(run / "config.json")
         seen, unseen = (
             {name: make_maze(parse_walls(text, source=name)) for name, text in made[key].items()}

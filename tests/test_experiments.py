@@ -50,6 +50,8 @@ def test_the_methods_of_the_table(robot):
         "mazes",
         "modes-ct",
         "modes",
+        "memory-ct",
+        "memory",
     ]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
@@ -67,6 +69,8 @@ def test_the_methods_of_the_table(robot):
     assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.modes > 1
+    for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
+        assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.stride > 1
     assert plan.variants["modes"].model.commitment > plan.variants["modes-ct"].model.commitment == 0.0
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 

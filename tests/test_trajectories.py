@@ -26,7 +26,7 @@ from ct_jax.trajectories import (
 MAZES = stack_mazes([load_maze("antmaze-umaze"), make_maze(random_walls(1)), make_maze(random_walls(2, height=12))])
 LENGTHS = [3, 17, 40]
 CELL = 0.8
-draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep"))
+draw = jax.jit(sample_windows, static_argnames=("batch", "steps", "map_cell_m", "shift_timestep", "stride"))
 GROUP = symmetries(POINT)
 
 
@@ -86,20 +86,21 @@ def test_maps_are_what_the_robot_saw_there(toy_data):
     np.testing.assert_array_equal(window.goal.reshape(-1, 2), goals - positions)
 
 
-def test_a_window_is_a_piece_of_a_trajectory(toy_data):
+@pytest.mark.parametrize("stride", [1, 3])
+def test_a_window_is_a_piece_of_a_trajectory(toy_data, stride):
     data = toy_data(LENGTHS)
     data = data.replace(learn=(np.random.default_rng(0).random(data.learn.shape) < 0.5).astype(np.float32))
-    window = windows(data, steps=5)
+    window = windows(data, steps=5, stride=stride)
     i, t = which_step(window, data)
-    inside = t < data.length[i]
+    inside = np.asarray(window.timestep) < data.length[i]
     np.testing.assert_array_equal(window.valid, inside)
-    np.testing.assert_array_equal(np.diff(t, axis=1)[inside[:, 1:]], 1)
-    np.testing.assert_array_equal(window.timestep, t[:, :1] + np.arange(5))
+    np.testing.assert_array_equal(np.diff(t, axis=1)[inside[:, 1:]], stride)
+    np.testing.assert_array_equal(window.timestep[inside], (t[:, :1] + stride * np.arange(5))[inside])
     for name in ("action", "target", "learn"):
         np.testing.assert_array_equal(getattr(window, name)[inside], getattr(data, name)[i, t][inside], err_msg=name)
     np.testing.assert_array_equal(np.asarray(window.rtg)[inside], np.asarray(data.rtg)[i, t][inside])
     assert not np.asarray(window.learn)[~inside].any()
-    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5].any()  # only short ones are cut
+    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones are cut
 
 
 def test_single_steps_are_drawn_evenly(toy_data):
@@ -116,9 +117,10 @@ def test_single_steps_are_drawn_evenly(toy_data):
     assert chi2 < 2 * inside.sum(), (chi2, inside.sum())
 
 
-def test_each_step_can_be_part_of_a_piece(toy_data):
+@pytest.mark.parametrize("stride", [1, 3])
+def test_each_step_can_be_part_of_a_piece(toy_data, stride):
     data = toy_data(LENGTHS)
-    window = windows(data, steps=8, batch=2000)
+    window = windows(data, steps=8, batch=2000, stride=stride)
     i, t = which_step(window, data)
     seen = np.zeros(data.reward.shape, bool)
     valid = np.asarray(window.valid) > 0
@@ -128,11 +130,13 @@ def test_each_step_can_be_part_of_a_piece(toy_data):
     np.testing.assert_allclose(share, data.length / data.length.sum(), atol=0.04)
 
 
-def test_first_and_last_steps_are_learned_as_often_as_others(toy_data):
+@pytest.mark.parametrize(("stride", "steps"), [(1, 8), (3, 4)])
+def test_first_and_last_steps_are_learned_as_often_as_others(toy_data, stride, steps):
     data = toy_data([40])
-    window = windows(data, steps=8, batch=4000)
+    window = windows(data, steps=steps, batch=4000, stride=stride)
     counts = np.bincount(which_step(window, data)[1].ravel(), minlength=40)
-    assert counts[[0, -1]].min() > 0.9 * counts[8:-8].mean() and window.valid.all()
+    middle = counts[stride * steps : -stride * steps]
+    assert counts[[0, -1]].min() > 0.9 * middle.mean() and window.valid.all()
 
 
 def test_shifted_timesteps_keep_their_pace(toy_data):

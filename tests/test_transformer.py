@@ -152,6 +152,18 @@ def test_acting_without_past_actions_is_the_forward_pass(layers, acting):
     np.testing.assert_allclose(act_along(config, params_of(config), piece), np.clip(whole, -1.0, 1.0), atol=1e-4)
 
 
+@pytest.mark.parametrize("stride", [2, 5])
+@pytest.mark.parametrize("actions", [True, False])
+def test_with_a_stride_each_step_sees_only_those_whole_strides_before_it(stride, actions):
+    config = replace(TINY, context_acting=3, max_timestep=16, actions=actions, stride=stride)
+    piece = episode(4, steps=21)
+    acted = act_along(config, params_of(config), piece)
+    for origin in range(stride):
+        every = {name: leaf[:, origin::stride] for name, leaf in (piece | {"action": acted}).items()}
+        whole = predict(config, every, context=3)
+        np.testing.assert_allclose(acted[:, origin::stride], np.clip(whole, -1.0, 1.0), atol=1e-4)
+
+
 def three_modes():
     """A model of three modes, a piece, and what it proposes at each of its steps."""
     config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
