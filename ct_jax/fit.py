@@ -130,8 +130,9 @@ class Fit:
 
 
 def _matrices(params: Any) -> Any:
-    """Weight decay is for matrices and kernels, not for biases and norms."""
-    return jax.tree.map(lambda leaf: leaf.ndim > 1, params)
+    """Weight decay is for matrices and kernels, not for biases and norms, nor for a skill that stays as it is."""
+    decays = jax.tree.map(lambda leaf: leaf.ndim > 1, params)
+    return decays | {"skill": jax.tree.map(lambda leaf: False, params["skill"])} if "skill" in params else decays
 
 
 def transformer_loss(model: ControlTransformer) -> Loss:

@@ -155,7 +155,8 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
     proprio_size, action_size = sizes(robot)
     maps, proprio, goal, *rest = sample_inputs(proprio_size, action_size)
-    transformer = ControlTransformer(settings.model, action_size)
+    sac = settings.sac if settings.model.skill else None
+    transformer = ControlTransformer(settings.model, action_size, sac)
     value = ValueNetwork(settings.value.width)
 
     def build(key: jax.Array) -> TransformerPolicy:
@@ -167,6 +168,7 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
             value_width=settings.value.width,
             optimism=settings.optimism,
             reprompt=settings.reprompt,
+            sac=sac,
         )
 
     policy = jax.eval_shape(build, jax.random.key(0))

@@ -30,7 +30,7 @@ from ct_jax.progress import Bar, Metrics
 from ct_jax.rooms import RoomCourse, evaluate_in_rooms
 from ct_jax.run import Run, drop_leftovers, open_run, training
 from ct_jax.trajectories import Trajectories
-from ct_jax.transformer import ControlTransformer
+from ct_jax.transformer import ControlTransformer, with_skill
 from ct_jax.value import ValueNetwork
 
 MAX_SEED = 2**32 - 1
@@ -93,7 +93,7 @@ def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
         return load_model(str(run.folder))
     controller, sac = course.controller(metrics)
     data = planning_trajectories(run, course, controller)
-    policy = _fit(run, data, metrics)
+    policy = _fit(run, controller, sac, data, metrics)
     if run.settings.rounds:
         policy = _finetune(run, course, policy, controller, data, metrics)
     model = TrainedModel(run.robot, replace(run.settings, sac=sac), policy, controller, run.made)
@@ -133,9 +133,11 @@ def describe(data: Trajectories) -> dict[str, Any]:
     return counts | {"mean_length": float(length.mean())}
 
 
-def _fit(run: Run, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
-    """Value network and transformer, from scratch."""
-    policy, _ = blank_model(run.robot, run.settings)
+def _fit(run: Run, controller: Any, sac: SacConfig, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
+    """Value network and transformer, from scratch but for a skill that it is given."""
+    policy, _ = blank_model(run.robot, replace(run.settings, sac=sac))
+    if policy.sac is not None:
+        policy = replace(policy, params=with_skill(policy.params, controller))
     if run.done("fit") is not None:
         return _fit_both(run, "fit", 0, policy, data, metrics)
     with run.stage("fit") as (_, info):
@@ -152,7 +154,7 @@ def _fit_both(
     last = number == settings.rounds
     suffix = f"-{number}" if number else ""
     keys = jax.random.split(jax.random.fold_in(run.key(stage), number), 4)
-    value, model = ValueNetwork(settings.value.width), ControlTransformer(settings.model, policy.action_size)
+    value, model = ValueNetwork(settings.value.width), policy.model
 
     def train_one(name: str, learner: Fit, params: Any, data: Trajectories, key: jax.Array) -> Any:
         return _fit_network(run, stage, name + suffix, learner, params, data, metrics, key)
@@ -165,7 +167,7 @@ def _fit_both(
     config = settings.fit
     if number:
         config = (settings.last_fit if last else None) or settings.round_fit or settings.fit
-    params = policy.params if number else init_params(keys[2], model, data)
+    params = policy.params if number else policy.params | {"params": init_params(keys[2], model, data)["params"]}
     learner = make_learner(model, config, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
     params = train_one("fit", learner, params, data, keys[3])
     return replace(policy, params=params, value_params=value_params)

@@ -8,6 +8,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
+from ct_jax.controllers.sac import SacConfig
 from ct_jax.rollout import Action, act_as_meant
 from ct_jax.transformer import Cache, ControlTransformer, ModelConfig, empty_cache
 from ct_jax.value import ValueNetwork
@@ -32,10 +33,11 @@ class TransformerPolicy:
     value_width: int = struct.field(pytree_node=False, default=128)
     optimism: float = struct.field(pytree_node=False, default=1.0)  # k: ask for k * V (paper)
     reprompt: bool = struct.field(pytree_node=False, default=False)  # never ask for more than V of the present state
+    sac: SacConfig | None = struct.field(pytree_node=False, default=None)  # of the controller that is its head
 
     @property
     def model(self) -> ControlTransformer:
-        return ControlTransformer(self.config, self.action_size)
+        return ControlTransformer(self.config, self.action_size, self.sac)
 
     def init(self, state: State) -> Conditioned:
         """Ask for the return that the value network predicts from the first observation."""

@@ -258,7 +258,15 @@ def get_preset(name: str, robot: str = "point") -> Settings:
 
 
 # Settings that came later, with what was before them: left out where they say just that, so that a run of then goes on.
-_LATER = {"rooms": None, "random_mazes": 0, "modes": 1, "commitment": 0.0, "stride": 1, "precision": "float32"}
+_LATER = {
+    "rooms": None,
+    "random_mazes": 0,
+    "modes": 1,
+    "commitment": 0.0,
+    "skill": False,
+    "stride": 1,
+    "precision": "float32",
+}
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:

@@ -29,4 +29,4 @@ def transfer(source: Any, fresh: Any) -> Any:
         return leaf
 
     moved = jax.tree_util.tree_map_with_path(take, {name: old[name] for name in kept}, kept)
-    return {"params": new | moved}
+    return fresh | {"params": new | moved}

@@ -13,12 +13,14 @@ from typing import Any, Literal, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from brax.training.acme.running_statistics import NestedMeanStd
 from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ct_envs.frames import own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
+from ct_jax.controllers.sac import SacConfig, SacController, controller_networks, input_size
 from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
@@ -45,6 +47,7 @@ class ModelConfig:
     directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
     modes: int = 1  # actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it
     commitment: float = 0.0  # when acting, keep to the mode chosen before unless another is e^commitment times likelier
+    skill: bool = False  # the head is the low-level controller, which stays as it is: the trunk tells it where to go
     stride: int = 1  # control steps from one step of the memory to the next (paper: 1)
 
     @property
@@ -170,6 +173,46 @@ class HeadingHead(nn.Module):
         return Dense(self.action_size)(hidden)
 
 
+class SkillHead(nn.Module):
+    """Actions of the low-level controller as it was learned, led by the trunk: to a point of the world's plane a mode.
+
+    For a body so easily brought down that a head of one's own, which learns a gait from examples, falls. The weights
+    lie in the collection "skill", see ``with_skill``, and get no gradient.
+    """
+
+    sac: SacConfig
+    action_size: int
+    modes: int = 1
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b M A"]:
+        where = GOAL_SCALE_M * Dense(2 * self.modes)(x)
+        where = where.reshape(*where.shape[:-1], self.modes, 2)
+        body = jnp.broadcast_to(proprio[..., None, :], (*where.shape[:-1], proprio.shape[-1]))
+        skill = self.variable("skill", "controller", lambda: self._blank(proprio.shape[-1]))
+        mean, std, policy = jax.lax.stop_gradient(tuple(skill.value[name] for name in ("mean", "std", "policy")))
+        sac = self.sac
+        controller = SacController(
+            NestedMeanStd(mean, std), policy, self.action_size, sac.hidden, sac.frame, sac.effort
+        )
+        action = controller(body.reshape(-1, body.shape[-1]), where.reshape(-1, 2))
+        return action.reshape(*where.shape[:-1], self.action_size)
+
+    def _blank(self, proprio_size: int) -> dict[str, Any]:
+        """A controller that has learned nothing."""
+        size = input_size(proprio_size, self.sac.frame)
+        networks = controller_networks(size, self.action_size, self.sac.hidden)
+        policy = networks.policy_network.init(jax.random.key(0))
+        return {"mean": jnp.zeros(size), "std": jnp.ones(size), "policy": policy}
+
+
+def with_skill(params: Any, controller: SacController) -> Any:
+    """The parameters of a model with a ``SkillHead``, which now is that controller."""
+    normalizer = controller.normalizer
+    skill = {"mean": normalizer.mean, "std": normalizer.std, "policy": controller.policy}
+    return params | {"skill": {"head": {"controller": skill}}}
+
+
 class Modes(NamedTuple):
     """Actions to choose from."""
 
@@ -190,10 +233,12 @@ class ControlTransformer(nn.Module):
 
     ``dtype`` is that of the computations, for training on accelerators in bfloat16; parameters and actions stay
     float32, and acting with a cache is for a model without it. ``attention`` names one of jax's implementations.
+    ``sac`` is the configuration of the controller that is the head, with ``config.skill``.
     """
 
     config: ModelConfig
     action_size: int
+    sac: SacConfig | None = None
     dtype: DTypeLike | None = None
     attention: Attention | None = None
 
@@ -211,7 +256,10 @@ class ControlTransformer(nn.Module):
         self.norm_in, self.norm_out = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
         self.dropout = Dropout(c.dropout)
         self.blocks = [Block(c, self.dtype, self.attention) for _ in range(c.layers)]
-        if c.frame == "heading":
+        if c.skill:
+            assert self.sac is not None
+            self.head = SkillHead(self.sac, self.action_size, c.modes)
+        elif c.frame == "heading":
             self.head = HeadingHead(c.directions, self.action_size, c.modes)
         else:
             self.predict_action = Dense(c.modes * self.action_size)
@@ -236,7 +284,7 @@ class ControlTransformer(nn.Module):
     def _predict(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Modes:
         """Actions from what the trunk makes of state tokens."""
         x, n = self.norm_out(x).astype(jnp.float32), self.config.modes
-        if self.config.frame == "heading":
+        if self.config.skill or self.config.frame == "heading":
             action = self.head(x, proprio)
         else:
             action = self.predict_action(x).reshape(*x.shape[:-1], n, self.action_size)
