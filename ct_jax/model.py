@@ -155,6 +155,8 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
     proprio_size, action_size = sizes(robot)
     maps, proprio, goal, *rest = sample_inputs(proprio_size, action_size)
+    if settings.model.skill and get_robot(robot).course == "room":
+        raise UserError(f"model.skill is for a controller that was learned; the {robot}'s is known")
     sac = settings.sac if settings.model.skill else None
     transformer = ControlTransformer(settings.model, action_size, sac)
     value = ValueNetwork(settings.value.width)

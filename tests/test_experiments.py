@@ -50,6 +50,8 @@ def test_the_methods_of_the_table(robot):
         "mazes",
         "modes-ct",
         "modes",
+        "skill-ct",
+        "skill",
         "memory-ct",
         "memory",
     ]
@@ -69,6 +71,8 @@ def test_the_methods_of_the_table(robot):
     assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.modes > 1
+    for name, one in (("skill-ct", lifted_ct), ("skill", lifted)):
+        assert plan.variants[name] == replace(one, model=replace(one.model, skill=True))
     for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.stride > 1
     assert plan.variants["modes"].model.commitment > plan.variants["modes-ct"].model.commitment == 0.0

@@ -114,13 +114,13 @@ def test_the_rate_warms_up_from_zero(data, params):
     assert 0 < sizes[1] < sizes[2] < 1.5 * CONFIG.learning_rate
 
 
-def test_biases_do_not_decay():
+def test_neither_biases_nor_skills_decay():
     learner = Fit(lambda params, window, key: jnp.zeros(()), replace(CONFIG, weight_decay=0.5, warmup=1), 0.8, POINT)
-    params = {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)}
+    params = {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2), "skill": {"kernel": jnp.ones((2, 2))}}
     state = learner.optimizer.init(params)
     for _ in range(2):
         change, state = learner.optimizer.update(jax.tree.map(jnp.zeros_like, params), state, params)
-    assert (change["kernel"] < 0).all() and (change["bias"] == 0).all()
+    assert (change["kernel"] < 0).all() and (change["bias"] == 0).all() and (change["skill"]["kernel"] == 0).all()
 
 
 # ---------------------------------------------------------------------------------------------------- stop and go on

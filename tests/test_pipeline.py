@@ -116,6 +116,19 @@ def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(ti
     assert {row["maze"] for row in pipeline.results(run.folder)} == {"antmaze-umaze"}
 
 
+@pytest.mark.rank_promotion("allow")  # brax's running statistics
+def test_a_skill_stays_the_runs_controller_through_all_rounds(tiny_settings, tmp_path):
+    model = dataclasses.replace(tiny_settings.model, skill=True)
+    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, model=model))
+    pipeline.train(run)
+    trained = load_model(str(run.folder))
+    skill, controller = trained.policy.params["skill"]["head"]["controller"], trained.controller
+    found = (skill["mean"], skill["std"], skill["policy"])
+    meant = (controller.normalizer.mean, controller.normalizer.std, controller.policy)
+    jax.tree.map(np.testing.assert_array_equal, found, meant)
+    assert "predict_action" not in trained.policy.params["params"]
+
+
 def test_the_random_mazes_are_always_the_same():
     """A run's config names their number only."""
     few, many = random_mazes(2), random_mazes(4)

@@ -19,7 +19,7 @@ ALL = (
         "default": Settings(),
         "many mazes": Settings(random_mazes=3),
         "modes": Settings(model=ModelConfig(modes=4, commitment=3.0)),
-        "stride": Settings(model=ModelConfig(stride=3)),
+        "skill with a stride": Settings(model=ModelConfig(skill=True, stride=3)),
         "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
     }
 )

@@ -7,16 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training.acme import running_statistics, specs
 
 from ct_envs.occupancy import MAP_CELLS
+from ct_jax.controllers.sac import SacConfig, SacController, controller_networks
 from ct_jax.transformer import (
     ControlTransformer,
     HeadingHead,
     MapEncoder,
     ModelConfig,
+    Modes,
     band,
     empty_cache,
     sample_inputs,
+    with_skill,
 )
 
 P, A = 3, 2
@@ -164,11 +168,54 @@ def test_with_a_stride_each_step_sees_only_those_whole_strides_before_it(stride,
         np.testing.assert_allclose(acted[:, origin::stride], np.clip(whole, -1.0, 1.0), atol=1e-4)
 
 
+def propose(model, params, inputs) -> Modes:
+    return jax.jit(lambda p: model.apply(p, *inputs, method="propose"))(params)  # pyright: ignore
+
+
+def skilled(**changes):
+    """A model whose head is a controller, its parameters, and the controller."""
+    sac = SacConfig(hidden=(8, 8), effort=0.5)
+    normalizer = running_statistics.init_state(specs.Array((P + 2,), jnp.dtype("float32")))
+    normalizer = normalizer.replace(mean=jnp.arange(P + 2.0) / 5, std=1.0 + jnp.arange(P + 2.0))
+    policy = controller_networks(P + 2, A, sac.hidden).policy_network.init(jax.random.key(3))
+    controller = SacController(normalizer, policy, A, sac.hidden, sac.frame, sac.effort)
+    model = ControlTransformer(replace(TINY, skill=True, **changes), A, sac)
+    params = jax.jit(model.init)(jax.random.key(0), *sample_inputs(P, A))
+    return model, with_skill(params, controller), controller
+
+
+@pytest.mark.rank_promotion("allow")  # brax's running statistics
+@pytest.mark.parametrize("modes", [1, 3])
+def test_a_skill_is_the_controller_sent_where_the_trunk_says(modes):
+    """Every proposed action is the controller's for some point, to be found by turning the one knob there is."""
+    model, params, controller = skilled(modes=modes)
+    piece = episode(1)
+    inputs = [piece[name] for name in INPUTS]
+    params["params"]["head"]["Dense_0"]["kernel"] *= 0.0
+    where = jnp.arange(2.0 * modes).reshape(modes, 2) - 1.5
+    params["params"]["head"]["Dense_0"]["bias"] = where.ravel() / 10.0
+    found = np.asarray(propose(model, params, inputs).action)
+    for i in range(modes):
+        flat = piece["proprio"].reshape(-1, P)
+        meant = controller(flat, jnp.broadcast_to(where[i], (len(flat), 2)))
+        np.testing.assert_allclose(found[:, :, i].reshape(-1, A), meant, atol=1e-5)
+    assert np.abs(found).max() <= 0.5  # its effort
+
+
+@pytest.mark.rank_promotion("allow")
+def test_a_skill_gets_no_gradient_and_leads_the_trunk():
+    model, params, _ = skilled()
+    inputs = [episode(1)[name] for name in INPUTS]
+    gradient = jax.jit(jax.grad(lambda p: (propose(model, p, inputs).best() ** 2).sum()))(params)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(gradient["skill"]))
+    assert all(np.any(gradient["params"][name]["kernel"]) for name in ("embed_goal", "embed_state"))
+
+
 def three_modes():
     """A model of three modes, a piece, and what it proposes at each of its steps."""
     config, piece = replace(TINY, modes=3, actions=False), episode(2, steps=21)
     params, inputs = params_of(config), [piece[name] for name in INPUTS]
-    modes = jax.jit(lambda p: ControlTransformer(config, A).apply(p, *inputs, method="propose"))(params)
+    modes = propose(ControlTransformer(config, A), params, inputs)
     return config, params, piece, modes
 
 
@@ -205,9 +252,7 @@ def test_committed_it_keeps_to_a_mode_unless_another_is_much_likelier():
 
 def test_with_one_mode_nothing_chooses():
     assert "predict_mode" not in params_of(TINY)["params"]
-    modes = ControlTransformer(TINY, A).apply(
-        params_of(TINY), *(episode(0)[name] for name in INPUTS), method="propose"
-    )  # fmt: skip
+    modes = propose(ControlTransformer(TINY, A), params_of(TINY), [episode(0)[name] for name in INPUTS])
     np.testing.assert_allclose(modes.action[:, :, 0], predict(TINY, episode(0)), atol=1e-5)
 
 
