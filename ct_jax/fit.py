@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ct_envs import Robot, UserError
-from ct_envs.frames import symmetries
+from ct_envs.frames import symmetries, turns
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
@@ -45,6 +45,8 @@ class FitConfig:
     decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
     clip: float = 1.0  # norm to which gradients are clipped
     mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
+    turns: bool = False  # with ``mirror``: only turn the world with the robot in it. A controller that is not symmetric
+    # itself has one gait; its mirror image is another, and what learns both learns their mean
     shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
     precision: str = "float32"  # of the transformer's computations; "bfloat16" on accelerators, parameters stay float32
 
@@ -82,6 +84,8 @@ class Fit:
         """
         self.loss, self.config, self.map_cell_m, self.stride = loss, config, map_cell_m, stride
         self._symmetries = symmetries(robot) if config.mirror else None
+        if self._symmetries is not None and config.turns:
+            self._symmetries = turns(self._symmetries)
         if config.decay:
             rate = optax.warmup_cosine_decay_schedule(
                 0.0, config.learning_rate, config.warmup, max(config.updates, config.warmup + 1)

@@ -164,7 +164,9 @@ def _for_humanoid(settings: Settings) -> Settings:
         takeover=recover.takeover / 3,
     )
     model = replace(settings.model, max_timestep=2048)
-    return replace(settings, recover=recover, model=model)
+    settings = replace(settings, recover=recover, model=model)
+    # Mirrored, its controller's actions are off by half of their variance.
+    return with_fits(settings, turns=True) if settings.fit.mirror else settings
 
 
 def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float) -> Settings:
@@ -175,9 +177,13 @@ def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float
     if not settings.reprompt:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)
+    return with_fits(replace(settings, model=model), steps=96)
+
+
+def with_fits(settings: Settings, **changes: Any) -> Settings:
+    """The settings with changes to all trainings of the transformer."""
     fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
-    longer = {name: replace(fit, steps=96) for name, fit in fits.items() if fit is not None}
-    return replace(settings, model=model, **longer)
+    return replace(settings, **{name: replace(fit, **changes) for name, fit in fits.items() if fit is not None})
 
 
 TURTLEBOT3_PAPER = Settings(
@@ -265,6 +271,7 @@ _LATER = {
     "commitment": 0.0,
     "skill": False,
     "stride": 1,
+    "turns": False,
     "precision": "float32",
 }
 

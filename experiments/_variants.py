@@ -27,7 +27,7 @@ from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
 from ct_jax.mazes import evaluated
 from ct_jax.model import load_controller
-from ct_jax.presets import Settings, get_preset, to_dict
+from ct_jax.presets import Settings, get_preset, to_dict, with_fits
 from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
@@ -141,8 +141,8 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             model = replace(lifted.model, modes=4, commitment=commitment)
             variants[f"modes{name}"] = replace(variants[f"cpu{name}"], model=model)
         for name in ("-ct", ""):
-            model = replace(lifted.model, skill=True)
-            variants[f"skill{name}"] = replace(variants[f"cpu{name}"], model=model)
+            skilled = replace(variants[f"cpu{name}"], model=replace(lifted.model, skill=True))
+            variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
         # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of the
         # point 16.
         model = replace(lifted.model, stride=4 if robot == "humanoid" else 3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ct_envs import ANT, HUMANOID, POINT, MazeEnv, UserError, make_maze
-from ct_envs.frames import own_frame, symmetries, turn
+from ct_envs.frames import own_frame, symmetries, transform, turn, turns
 from ct_envs.physics import PhysicsState
 from ct_envs.robots import Robot
 
@@ -61,6 +61,19 @@ def test_symmetries_are_a_group(robot):
         for b in range(len(rows)):
             product = np.concatenate([(m[a] @ m[b]).ravel() for m in (group.world, group.action)])
             assert tuple(np.round(product).astype(int)) in known
+
+
+@pytest.mark.parametrize(("robot", "size"), [(POINT, 1), (ANT, 4), (HUMANOID, 4)], ids=["point", "ant", "humanoid"])
+def test_turns_are_what_the_body_does_not_feel(robot, size):
+    """Quarters of the world's circle; of the point, whose action is a vector of the world, none but nothing."""
+    group = turns(symmetries(robot))
+    angles = np.arctan2(group.world[:, 1, 0], group.world[:, 0, 0])
+    np.testing.assert_allclose(np.sort(angles % (2 * np.pi)), np.arange(size) * np.pi / 2, atol=1e-6)
+    if size > 1:
+        proprio = jnp.broadcast_to(first_proprio(robot), (size, group.proprio.shape[-1]))
+        heading, own = own_frame(transform(group.proprio, proprio))
+        np.testing.assert_allclose(own, own_frame(proprio)[1], atol=1e-5)
+        np.testing.assert_allclose(heading, transform(group.world, own_frame(proprio)[0]), atol=1e-5)
 
 
 def test_own_frame_does_not_see_the_world_turn():

@@ -20,7 +20,7 @@ ALL = (
         "many mazes": Settings(random_mazes=3),
         "modes": Settings(model=ModelConfig(modes=4, commitment=3.0)),
         "skill with a stride": Settings(model=ModelConfig(skill=True, stride=3)),
-        "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True)),
+        "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True, turns=True)),
     }
 )
 

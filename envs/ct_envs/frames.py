@@ -51,6 +51,12 @@ def symmetries(robot: Robot) -> Symmetries:
     return Symmetries(*(np.stack(matrices).astype(np.float32) for matrices in zip(*found, strict=True)))
 
 
+def turns(found: Symmetries) -> Symmetries:
+    """Of the symmetries those that turn the world with the robot in it, and do nothing to its joints."""
+    plain = (np.linalg.det(found.world) > 0) & np.isclose(found.action, np.eye(found.action.shape[-1])).all((1, 2))
+    return Symmetries(*(matrices[plain] for matrices in found))
+
+
 def _point() -> list[tuple[np.ndarray, ...]]:
     return [(matrix, matrix, matrix) for matrix in (_FLIP_X, _SWAP)]
 
