@@ -81,7 +81,7 @@ def draw(controllers: list[dict[str, Any]], file: Path) -> None:
     """Success on held-out edges against time."""
     from matplotlib.figure import Figure
 
-    figure = Figure((5.2, 3.2), layout="constrained")
+    figure = Figure((5.2, 3.8), layout="constrained")
     ax = figure.add_subplot()
     for found in controllers:
         if curve := minutes(found):
@@ -91,7 +91,7 @@ def draw(controllers: list[dict[str, Any]], file: Path) -> None:
     ax.set(xlabel="training [min]", ylabel="held-out edges walked in time [%]", ylim=(0, 101), xscale="log")
     ax.grid(alpha=0.3)
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.legend(loc="center")
+    figure.legend(loc="outside upper center")
     figure.savefig(file, dpi=150)
 
 
