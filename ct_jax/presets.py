@@ -165,8 +165,11 @@ def _for_humanoid(settings: Settings) -> Settings:
     )
     model = replace(settings.model, max_timestep=2048)
     settings = replace(settings, recover=recover, model=model)
-    # Mirrored, its controller's actions are off by half of their variance.
-    return with_fits(settings, turns=True) if settings.fit.mirror else settings
+    if not settings.reprompt:
+        return settings
+    # The controller's actions change fast with the body's attitude: a head that learned them from examples fell.
+    # Mirrored, they are off by half of their variance.
+    return with_fits(replace(settings, model=replace(model, skill=True)), turns=True)
 
 
 def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float) -> Settings:

@@ -17,13 +17,8 @@ import numpy as np
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
-_LIFTED = (
-    "cpu",
-    "modes",
-    "memory",
-    "skill",
-    "mazes",
-)  # variants of F-CT; before fine-tuning, each was the one with "-ct"
+# Variants of F-CT; before fine-tuning, each was the one with "-ct".
+_LIFTED = ("cpu", "modes", "memory", "skill", "mazes")
 FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]

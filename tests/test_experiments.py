@@ -50,8 +50,7 @@ def test_the_methods_of_the_table(robot):
         "mazes",
         "modes-ct",
         "modes",
-        "skill-ct",
-        "skill",
+        *(["skill-ct", "skill"] if robot != "humanoid" else []),  # whose cpu has it
         "memory-ct",
         "memory",
     ]
@@ -72,7 +71,7 @@ def test_the_methods_of_the_table(robot):
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.modes > 1
     for name, one in (("skill-ct", lifted_ct), ("skill", lifted)):
-        found = plan.variants[name]
+        found = plan.variants[name] if robot != "humanoid" else one
         assert found == with_fits(replace(one, model=replace(one.model, skill=True)), turns=robot != "point")
     for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.stride > 1
