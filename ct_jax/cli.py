@@ -108,7 +108,7 @@ class Evaluate:
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
-    """Run folder, or a model that ships with the package: zoo:point, zoo:ant or zoo:turtlebot3."""
+    """Run folder, or a model that ships with the package: zoo:point, zoo:ant, zoo:humanoid or zoo:turtlebot3."""
     maze: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: antmaze-large)")] = None
     """Maze by name or text file."""
     episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 100)")] = None
