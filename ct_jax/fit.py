@@ -171,10 +171,15 @@ def value_loss(model: ValueNetwork) -> Loss:
     return loss
 
 
-def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: Trajectories) -> Any:
-    """Fresh parameters for data of these sizes."""
+def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: Trajectories, given: Any = None) -> Any:
+    """Fresh parameters for data of these sizes.
+
+    Args:
+        given: parameters of which what is not learned, a skill, stays.
+    """
     inputs = sample_inputs(data.proprio.shape[-1], data.action.shape[-1])
-    return jax.jit(model.init)(key, *(inputs[:3] if isinstance(model, ValueNetwork) else inputs))
+    fresh = jax.jit(model.init)(key, *(inputs[:3] if isinstance(model, ValueNetwork) else inputs))
+    return fresh if given is None else given | {"params": fresh["params"]}
 
 
 def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m: float) -> Trajectories:

@@ -167,7 +167,7 @@ def _fit_both(
     config = settings.fit
     if number:
         config = (settings.last_fit if last else None) or settings.round_fit or settings.fit
-    params = policy.params if number else policy.params | {"params": init_params(keys[2], model, data)["params"]}
+    params = policy.params if number else init_params(keys[2], model, data, policy.params)
     learner = make_learner(model, config, settings.model.map_cell_m, run.spec)  # pyright: ignore[reportArgumentType]
     params = train_one("fit", learner, params, data, keys[3])
     return replace(policy, params=params, value_params=value_params)

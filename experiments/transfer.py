@@ -88,7 +88,8 @@ class Target:
 def curve(target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path) -> list[dict]:
     """Success after each number of updates, from a source's trunk or from scratch; resumable."""
     init_key, fit_key = jax.random.split(jax.random.key(seed))
-    params = init_params(init_key, target.model.policy.model, target.data)
+    policy = target.model.policy
+    params = init_params(init_key, policy.model, target.data, policy.params)
     if source is not None:
         params = transfer(source.policy.params, params)
     robot, (name, maze) = target.env.robot, target.unseen
