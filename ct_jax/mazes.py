@@ -164,7 +164,7 @@ def evaluate_in_maze(
         raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
     world = load_maze(maze)
     if video is not None:
-        from ct_jax.report.video import check_video, write_video  # likewise
+        from ct_jax.report.video import check_video, write_video  # with matplotlib, which takes its time
 
         check_video(video)
     env = MazeEnv(model.robot, engine=engine, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
@@ -174,7 +174,7 @@ def evaluate_in_maze(
     outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
     row = head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
     if picture is not None and devices.is_first():
-        from ct_jax.report import pictures  # matplotlib, which takes its time
+        from ct_jax.report import pictures  # likewise
 
         reached = f"{int(outcome.success.sum())} of {len(outcome.success)} reached the goal"
         pictures.write_paths(picture, unpadded(world), outcome, f"{model.robot}, {method} in {name}: {reached}")

@@ -10,14 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.training.acme import running_statistics, specs
 
 from ct_envs import MazeEnv, UserError
 from ct_envs.robots import get_robot
 from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.controllers.differential_drive import DifferentialDrive
-from ct_jax.controllers.sac import SacConfig, SacController, controller_networks, input_size
+from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
@@ -180,16 +179,7 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
 
 
 def _blank_sac(key: jax.Array, robot: str, config: SacConfig) -> SacController:
-    proprio_size, action_size = sizes(robot)
-    size = input_size(proprio_size, config.frame)
-    return SacController(
-        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
-        policy=controller_networks(size, action_size, config.hidden).policy_network.init(key),
-        action_size=action_size,
-        hidden=config.hidden,
-        frame=config.frame,
-        effort=config.effort,
-    )
+    return blank_controller(key, *sizes(robot), config)
 
 
 def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ct_envs.frames import own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.controllers.sac import SacConfig, SacController, controller_networks, input_size
+from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
@@ -189,7 +189,8 @@ class SkillHead(nn.Module):
         where = GOAL_SCALE_M * Dense(2 * self.modes)(x)
         where = where.reshape(*where.shape[:-1], self.modes, 2)
         body = jnp.broadcast_to(proprio[..., None, :], (*where.shape[:-1], proprio.shape[-1]))
-        skill = self.variable("skill", "controller", lambda: self._blank(proprio.shape[-1]))
+        blank = functools.partial(blank_controller, jax.random.key(0), proprio.shape[-1], self.action_size, self.sac)
+        skill = self.variable("skill", "controller", lambda: _skill(blank()))
         mean, std, policy = jax.lax.stop_gradient(tuple(skill.value[name] for name in ("mean", "std", "policy")))
         sac = self.sac
         controller = SacController(
@@ -198,19 +199,15 @@ class SkillHead(nn.Module):
         action = controller(body.reshape(-1, body.shape[-1]), where.reshape(-1, 2))
         return action.reshape(*where.shape[:-1], self.action_size)
 
-    def _blank(self, proprio_size: int) -> dict[str, Any]:
-        """A controller that has learned nothing."""
-        size = input_size(proprio_size, self.sac.frame)
-        networks = controller_networks(size, self.action_size, self.sac.hidden)
-        policy = networks.policy_network.init(jax.random.key(0))
-        return {"mean": jnp.zeros(size), "std": jnp.ones(size), "policy": policy}
+
+def _skill(controller: SacController) -> dict[str, Any]:
+    """What of a controller a ``SkillHead`` keeps."""
+    return {"mean": controller.normalizer.mean, "std": controller.normalizer.std, "policy": controller.policy}
 
 
 def with_skill(params: Any, controller: SacController) -> Any:
     """The parameters of a model with a ``SkillHead``, which now is that controller."""
-    normalizer = controller.normalizer
-    skill = {"mean": normalizer.mean, "std": normalizer.std, "policy": controller.policy}
-    return params | {"skill": {"head": {"controller": skill}}}
+    return params | {"skill": {"head": {"controller": _skill(controller)}}}
 
 
 class Modes(NamedTuple):

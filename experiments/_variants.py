@@ -140,9 +140,10 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         for name, commitment in (("-ct", 0.0), ("", 3.0)):
             model = replace(lifted.model, modes=4, commitment=commitment)
             variants[f"modes{name}"] = replace(variants[f"cpu{name}"], model=model)
-        for name in ("-ct", "") if not lifted.model.skill else ():
-            skilled = replace(variants[f"cpu{name}"], model=replace(lifted.model, skill=True))
-            variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
+        if not lifted.model.skill:
+            for name in ("-ct", ""):
+                skilled = replace(variants[f"cpu{name}"], model=replace(lifted.model, skill=True))
+                variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
         # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of the
         # point 16.
         model = replace(lifted.model, stride=4 if robot == "humanoid" else 3)

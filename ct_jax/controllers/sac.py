@@ -146,6 +146,19 @@ class SacController:
         return self.effort * networks.parametric_action_distribution.mode(logits)
 
 
+def blank_controller(key: jax.Array, proprio_size: int, action_size: int, config: SacConfig) -> SacController:
+    """A controller of these sizes that has learned nothing."""
+    size = input_size(proprio_size, config.frame)
+    return SacController(
+        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
+        policy=controller_networks(size, action_size, config.hidden).policy_network.init(key),
+        action_size=action_size,
+        hidden=config.hidden,
+        frame=config.frame,
+        effort=config.effort,
+    )
+
+
 def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Tasks]:
     """Edges, each in both directions, as training and held-out tasks: an edge's two directions stay together.
 
