@@ -127,7 +127,7 @@ def measured(options: ScaleOptions, samples: int) -> Measured:
 
 def weigh(robot: str, settings: Settings) -> Sizes:
     """Sizes of the arrays, and what XLA says of an update on all devices there are."""
-    model = ControlTransformer(settings.model, sizes(robot)[1])
+    model = ControlTransformer(settings.model, sizes(robot)[1], settings.sac)
     learner = Fit(transformer_loss(model), settings.fit, settings.model.map_cell_m, get_robot(robot))
     steps = -(-settings.collect.horizon // 256) * 256  # as ``spread`` fills them up
     data = jax.eval_shape(lambda: trajectories(robot, SMALL, steps))

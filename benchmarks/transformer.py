@@ -78,7 +78,8 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
     """The rows of one model."""
     settings = get_preset(options.preset, robot)
     fit, map_cell_m, spec = settings.fit, settings.model.map_cell_m, get_robot(robot)
-    model = ControlTransformer(settings.model, sizes(robot)[1], dtype=jnp.dtype(dtype), attention=attention)
+    size, sac = sizes(robot)[1], settings.sac
+    model = ControlTransformer(settings.model, size, sac, dtype=jnp.dtype(dtype), attention=attention)
     data = trajectories(robot)
     mazes = stack_mazes([load_maze("antmaze-large")]) if data.map_bits is None else None
     learner = Fit(transformer_loss(model), fit, map_cell_m, spec)
@@ -87,7 +88,7 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
         key, data, data.rtg, mazes, batch=fit.batch, steps=fit.steps, map_cell_m=map_cell_m))  # fmt: skip
     window = draw(jax.random.key(2))
     # of plain attention in any case: what cuDNN does inside is not counted
-    plain = ControlTransformer(settings.model, model.action_size)
+    plain = ControlTransformer(settings.model, size, sac)
     step_flop = flop(plain, state.params, window)
     accelerator = jax.default_backend() != "cpu"
     updates = max(1, int((100 if accelerator else 1) * options.gflop * 1e9 / step_flop))

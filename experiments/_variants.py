@@ -55,7 +55,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac, cpu-ct, cpu, mazes-ct, mazes, modes-ct, modes. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill and mazes, each with
+    -ct, too, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -136,19 +137,18 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
         variants |= _of_many_mazes(lifted)
-        # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
-        for name, commitment in (("-ct", 0.0), ("", 3.0)):
-            model = replace(lifted.model, modes=4, commitment=commitment)
-            variants[f"modes{name}"] = replace(variants[f"cpu{name}"], model=model)
-        if not lifted.model.skill:
-            for name in ("-ct", ""):
-                skilled = replace(variants[f"cpu{name}"], model=replace(lifted.model, skill=True))
-                variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
-        # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of the
-        # point 16.
-        model = replace(lifted.model, stride=4 if robot == "humanoid" else 3)
         for name in ("-ct", ""):
-            variants[f"memory{name}"] = replace(variants[f"cpu{name}"], model=model)
+            base = variants[f"cpu{name}"]
+            # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
+            modes = replace(lifted.model, modes=4, commitment=0.0 if name else 3.0)
+            variants[f"modes{name}"] = replace(base, model=modes)
+            # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of
+            # the point 16.
+            memory = replace(lifted.model, stride=4 if robot == "humanoid" else 3)
+            variants[f"memory{name}"] = replace(base, model=memory)
+            if not lifted.model.skill:
+                skilled = replace(base, model=replace(lifted.model, skill=True))
+                variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
     return Plan(variants, baselines)
 
 

@@ -48,11 +48,7 @@ def test_the_methods_of_the_table(robot):
         "cpu",
         "mazes-ct",
         "mazes",
-        "modes-ct",
-        "modes",
-        *(["skill-ct", "skill"] if robot != "humanoid" else []),  # whose cpu has it
-        "memory-ct",
-        "memory",
+        *(f"{name}{ct}" for ct in ("-ct", "") for name in ("modes", "memory", *(["skill"] if robot != "humanoid" else []))),
     ]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
