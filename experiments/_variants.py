@@ -32,7 +32,6 @@ from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
     default_mazes,
-    drop_leftovers,
     episodes_file,
     join_mazes,
     load_mazes,
@@ -55,8 +54,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill and mazes, each with
-    -ct, too, which is without fine-tuning. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill and mazes, and each of
+    them with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -243,7 +242,8 @@ def share(source: Run, run: Run) -> None:
 def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     """A row with what made its model, or, where it says so itself, with what measured it later."""
     config = read_json(run.folder / "config.json")
-    walls = {done.parent.name: read_json(done)["wall_s"] for done in sorted(run.folder.glob("*/done.json"))}
+    stages = [*sorted(run.folder.glob("*/done.json")), run.folder / "baselines" / row["method"] / "done.json"]
+    walls = {done.parent.name: read_json(done)["wall_s"] for done in stages if done.is_file()}
     made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
     if row["method"] in GUIDED and margin(run) is not None:
         made["margin_m"] = margin(run)
@@ -251,6 +251,8 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
         where = run.settings.controller
         made["controller"] = controller_digest(str(run.folder) if where == "own" else where, run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
+    if row["method"] in walls:
+        made["learn_wall_s"] = round(walls[row["method"]])  # of it
     return made | origin(config) | row
 
 
@@ -337,8 +339,8 @@ def baseline(
     run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
 ) -> list[dict[str, Any]]:
     """Rows of one baseline, learned unless its weights are there."""
-    frame = config.frame
-    folder = run.folder / "baselines" / name
+    frame, stage = config.frame, f"baselines/{name}"
+    folder = run.folder / stage
     env = run.env(auto_reset=False)
     actor = Actor(env.action_size, width, frame)
     params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
@@ -346,15 +348,14 @@ def baseline(
     file = folder / "weights.safetensors"
     with open_run(run, resume=True):
         (run.folder / "evaluate").mkdir(exist_ok=True)  # of the pairs
-        folder.mkdir(parents=True, exist_ok=True)
         made = claim(folder / "baseline.json", asdict(config), "settings")
-        if not file.is_file():
-            metrics = Metrics(folder)
-            with training(folder, name, total, metrics) as watch:
-                learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
-            metrics.close()
-            save_weights(file, learned.params)
-            drop_leftovers(folder)
+        if run.done(stage) is None:
+            with run.stage(stage):
+                metrics = Metrics(folder)
+                with training(folder, name, total, metrics) as watch:
+                    learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
+                metrics.close()
+                save_weights(file, learned.params)
         policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
         mazes = join_mazes(run.mazes, run.eval_mazes).items()
         rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
