@@ -54,7 +54,7 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill and mazes, and each of
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill, mazes, and each of
     them with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
