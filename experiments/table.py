@@ -156,24 +156,26 @@ def line_of(row: dict[str, Any]) -> str:
 
 
 def transfer_table(results: dict[str, Any]) -> list[str]:
-    """One line for each robot and start: success after so many updates, and when 90 % of the final one was there.
+    """One line for each robot, run and start: success after so many updates, and when 90 % of the final one was there.
 
     The final success is the better of both starts' means after the last update. Between two of the numbers of updates
     success is taken to grow with their logarithm.
     """
     rows = results["rows"]
     marks = sorted({row["updates"] for row in rows})
-    names = ["robot", "start", *(f"{mark}" for mark in marks), "90 % of the final at"]
+    names = ["robot", "run", "start", *(f"{mark}" for mark in marks), "90 % of the final at"]
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    means: dict[tuple[str, str], list[float]] = {}
-    for start in dict.fromkeys((row["robot"], row["start"]) for row in rows):
-        mine = [row for row in rows if (row["robot"], row["start"]) == start]
+    means: dict[tuple[str, str, str], list[float]] = {}
+    subject = lambda row: (row["robot"], row["run"], row["start"])  # noqa: E731
+    for start in dict.fromkeys(map(subject, rows)):
+        mine = [row for row in rows if subject(row) == start]
         means[start] = [np.mean([r["success_rate"] for r in mine if r["updates"] == mark]) for mark in marks]
-    for (robot, start), curve in means.items():
-        enough = 0.9 * max(other[-1] for (of, _), other in means.items() if of == robot)
+    for (robot, run, start), curve in means.items():
+        enough = 0.9 * max(other[-1] for of, other in means.items() if of[:2] == (robot, run))
         reached = _reached(marks, curve, enough)
         how = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
-        lines.append("| " + " | ".join([robot, how, *(f"{100 * mean:.0f}" for mean in curve), reached]) + " |")
+        cells = [robot, f"`{run}`", how, *(f"{100 * mean:.0f}" for mean in curve), reached]
+        lines.append("| " + " | ".join(cells) + " |")
     seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows}))
     on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of seeds {seeds}"
     return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]

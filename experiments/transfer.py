@@ -1,11 +1,11 @@
 """Transfer between the point robot and the ant (the paper's figure): success against updates, with and without.
 
-    python experiments/transfer.py [--point runs/point/cpu-0] [--ant runs/ant/cpu-0] [--seeds 0 1 2]
+    python experiments/transfer.py [--robots ant point] [--point runs/point/cpu-0] [--ant runs/ant/cpu-0]
 
 Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
 transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
 robot's model (``ct_jax.transfer``), and tried on the run's pairs in the unseen maze as training goes on. Writes
-``experiments/results/transfer.json`` and ``docs/transfer.png``.
+``experiments/results/transfer.json``, in which curves of other runs and seeds stay, and ``docs/transfer.png``.
 """
 
 import functools
@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
-from _variants import claim, origin
+from _variants import claim, origin, replace_rows
 from matplotlib.figure import Figure
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
@@ -45,6 +45,8 @@ class Options:
     """A finished run of the point robot."""
     ant: Path = Path("runs/ant/cpu-0")
     """A finished run of the ant."""
+    robots: tuple[str, ...] = ("ant", "point")
+    """Robots to fit a transformer for, each with the trunk of the other."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the fits."""
     marks: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1600)
@@ -116,27 +118,32 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
 
 def measure(options: Options) -> list[dict[str, Any]]:
     """All curves' rows."""
-    runs = {"point": options.point, "ant": options.ant}
+    runs, others = {"point": options.point, "ant": options.ant}, {"point": "ant", "ant": "point"}
+    for robot in options.robots:
+        if robot not in runs:
+            raise UserError(f"--robots {robot}: give {' or '.join(runs)}")
     make = functools.cache(lambda robot: Target.of(runs[robot], max(options.marks)))
     rows = []
-    for robot, other in (("ant", "point"), ("point", "ant")):
+    for robot in options.robots:
+        other = others[robot]
         for seed in options.seeds:
             for start in ("scratch", "transfer"):
                 source = make(other).model if start == "transfer" else None
-                folder = options.out / robot / f"{start}-{seed}"
+                folder = options.out / f"{robot}-{runs[robot].name}" / f"{start}-{seed}"
                 of = {"robot": runs[robot], "other": runs[other], "episodes": options.episodes}
                 claim(folder / "curve.json", of, "runs or pairs")
-                head = {"robot": robot, "start": other if source else "scratch", "seed": seed}
+                head = {"robot": robot, "run": runs[robot].name, "start": other if source else "scratch", "seed": seed}
                 rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
     return rows
 
 
 def draw(rows: list[dict[str, Any]], file: Path) -> None:
     """Success against updates: means over seeds, and their range."""
-    figure = Figure((8.0, 3.2), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    for ax, robot in zip(axes, ("ant", "point"), strict=True):
-        mine = [row for row in rows if row["robot"] == robot]
+    subjects = list(dict.fromkeys((row["robot"], row["run"]) for row in rows))
+    figure = Figure((4.0 * len(subjects), 3.2), layout="constrained")
+    axes = figure.subplots(1, len(subjects), sharey=True, squeeze=False)[0]
+    for ax, subject in zip(axes, subjects, strict=True):
+        mine = [row for row in rows if (row["robot"], row["run"]) == subject]
         for start, colour in zip(sorted({row["start"] for row in mine}), ("#1b6ca8", "#c8400e"), strict=False):
             marks = sorted({row["updates"] for row in mine})
             values = [
@@ -145,7 +152,8 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
             name = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
             ax.plot(marks, [np.mean(v) for v in values], marker="o", color=colour, label=name)
             ax.fill_between(marks, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
-        ax.set(xscale="log", xlabel="updates", title=robot, ylim=(0, 100), xticks=marks, xticklabels=map(str, marks))
+        ax.set(title=", ".join(subject), xlabel="updates", xscale="log", ylim=(0, 100))
+        ax.set_xticks(marks, map(str, marks))
         ax.minorticks_off()
         ax.legend(loc="best", frameon=False)
     axes[0].set_ylabel("success in the unseen maze [%]")
@@ -157,8 +165,7 @@ def main(options: Options) -> None:
     prepare_jax()
     rows = measure(options)
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    write_json(RESULTS, {"rows": rows})
-    draw(rows, PICTURE)
+    draw(replace_rows(RESULTS, rows, ("robot", "run", "start", "seed", "updates")), PICTURE)
     print(f"results: {RESULTS}\npicture: {PICTURE}")
 
 
