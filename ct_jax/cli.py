@@ -71,8 +71,9 @@ class Train:
     robot: Annotated[Positional[str], arg(metavar="ROBOT")]
     """Robot to train: point, ant, humanoid or turtlebot3 (in PyBullet, in cluttered rooms instead of mazes)."""
     preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
-    """How much of everything: demo (minutes), cpu (an hour on two cores), published (the bare method at that size) or
-    paper (the published sizes; wants a GPU)."""
+    """How much of everything: demo (minutes; walkers take longer), cpu (an hour on two cores, and one or two more for a
+    controller of one's own that walks), published (the bare method at that size) or paper (the published sizes; wants a
+    GPU)."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/ROBOT-PRESET-SEED)")] = None
     """Run folder."""
     seed: Annotated[int, arg(metavar="N")] = 0
@@ -84,7 +85,7 @@ class Train:
     random_mazes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
     """Collect trajectories and recoveries in so many random mazes besides."""
     controller: Annotated[str | None, arg(metavar="own|zoo|RUN")] = None
-    """Low-level controller: learn one's own (by default; the ant's demo takes zoo), take the one that ships with the
+    """Low-level controller: learn one's own (by default; walkers' demos take zoo), take the one that ships with the
     package, or that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
     """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""

@@ -110,7 +110,7 @@ def recover(
         With ``keep="separate"`` two trajectories for each recovery, otherwise one.
 
     Raises:
-        UserError: too few recoveries within ``give_up * T`` episodes, or a ``keep`` that means nothing.
+        UserError: no recovery within ``give_up * T`` episodes, or a ``keep`` that means nothing.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     first_maze = int(jax.random.randint(key, (), 0, len(mazes.cell_m)))  # where there are many, each round in others
@@ -136,7 +136,7 @@ def gather_recoveries(
     wave: Callable[[int], tuple[Trajectories, np.ndarray, np.ndarray]],
     on_progress: Callable[[int, int], None],
 ) -> Trajectories:
-    """The loop of Algorithm 4: supervised episodes, wave after wave, until T were recovered.
+    """The loop of Algorithm 4: supervised episodes, wave after wave, until T were recovered, or ``give_up * T`` began.
 
     Args:
         envs: episodes of a wave, of at most ``horizon`` steps.

@@ -17,7 +17,7 @@ from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
 from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, draw_pairs, evaluate
 from ct_jax.finetune import recover
-from ct_jax.model import TrainedModel, load_controller, save_controller
+from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
@@ -37,12 +37,15 @@ class MazeCourse:
     run: Run
 
     def controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
-        """The run's own controller, or the given one, and its configuration."""
+        """The run's own controller, learned or taken over once from where it was given, and its configuration."""
         run, config = self.run, self.run.settings.sac
-        if run.settings.controller != "own":
-            return load_controller(run.settings.controller, run.robot)
         if run.done("controller") is not None:
             return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))
+        if run.settings.controller != "own":  # a copy: whatever comes to lie there, the run goes on with what it had
+            with run.stage("controller") as (folder, info):
+                devices.first(lambda: copy_controller(run.settings.controller, run.robot, folder))
+                info |= {"given": run.settings.controller}
+            return load_controller(str(run.folder), run.robot)
         roadmap = _roadmap(run)
         with run.stage("controller") as (folder, info):
             with training(folder, "controller", config.iterations, metrics) as watch:

@@ -115,12 +115,7 @@ def load_controller(
     Raises:
         UserError: there is none, it is damaged, or it is another robot's (both are described).
     """
-    if where == "zoo":
-        folder = Path(str(resources.files("ct_jax") / "zoo" / "controllers" / robot))
-    else:
-        folder = next((f for f in (Path(where) / "controller", Path(where)) if (f / "controller.json").is_file()), None)
-    if folder is None or not (folder / "controller.json").is_file():
-        raise UserError(f"no controller of robot '{robot}' in '{where}'; give a run folder, 'zoo', or learn your 'own'")
+    folder = _controller_folder(where, robot)
     file = folder / "controller.json"
     found = read_json(file, mend=mend)
     needed = _sizes(robot)
@@ -134,6 +129,24 @@ def load_controller(
         raise UserError(f"{file}: not a controller's description ({bad}); {mend}") from None
     blank = jax.eval_shape(lambda key: _blank_sac(key, robot, config), jax.random.key(0))
     return jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", blank, mend=mend)), config
+
+
+def copy_controller(where: str, robot: str, folder: Path) -> None:
+    """Copy a controller's files into a folder that exists, if ``load_controller`` takes it. Raises UserError, as it."""
+    load_controller(where, robot)
+    for name in ("weights.safetensors", "controller.json"):
+        (folder / name).write_bytes((_controller_folder(where, robot) / name).read_bytes())
+
+
+def _controller_folder(where: str, robot: str) -> Path:
+    if where == "zoo":
+        folders = (Path(str(resources.files("ct_jax") / "zoo" / "controllers" / robot)),)
+    else:
+        folders = Path(where) / "controller", Path(where)
+    found = next((folder for folder in folders if (folder / "controller.json").is_file()), None)
+    if found is None:
+        raise UserError(f"no controller of robot '{robot}' in '{where}'; give a run folder, 'zoo', or learn your 'own'")
+    return found
 
 
 def _sizes(robot: str) -> dict[str, Any]:

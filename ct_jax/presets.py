@@ -245,13 +245,14 @@ TURTLEBOT3_PRESETS = {
 
 _OF_ROBOT: dict[str, Callable[[], dict[str, Settings]]] = {
     "point": lambda: PRESETS,
-    # A gait is not learned in minutes.
+    # A gait is not learned in minutes: their demos are led by the controller that ships.
     "ant": lambda: (
         {name: _for_ant(settings) for name, settings in PRESETS.items()}
         | {"demo": replace(_for_ant(DEMO), controller="zoo")}
     ),
     "humanoid": lambda: (
         {name: _for_humanoid(settings) for name, settings in PRESETS.items()}
+        | {"demo": replace(_for_humanoid(DEMO), controller="zoo")}
         | {"paper": replace(_for_humanoid(PAPER), sac=_HUMANOID_SAC_GPU)}
     ),
     "turtlebot3": lambda: TURTLEBOT3_PRESETS,

@@ -248,8 +248,7 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     if row["method"] in GUIDED and margin(run) is not None:
         made["margin_m"] = margin(run)
     if margin(run) is not None and row["method"] != "sac":  # which nothing led
-        where = run.settings.controller
-        made["controller"] = controller_digest(str(run.folder) if where == "own" else where, run.robot)
+        made["controller"] = controller_digest(str(run.folder), run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     if row["method"] in walls:
         made["learn_wall_s"] = round(walls[row["method"]])  # of it
@@ -258,7 +257,7 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
 
 @functools.cache  # all rows of a run ask
 def controller_digest(where: str, robot: str) -> str:
-    """Some letters that tell low-level controllers apart, each named as ``load_controller`` names it."""
+    """Some letters that tell low-level controllers apart, each of a run's folder."""
     return digest_of(load_controller(where, robot)[0])
 
 
@@ -267,9 +266,11 @@ def digest_of(tree: Any) -> str:
     return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))).hexdigest()[:12]
 
 
-def digest(settings: Settings) -> str:
-    """Some letters that tell settings apart."""
-    return hashlib.sha256(json.dumps(to_dict(settings), sort_keys=True).encode()).hexdigest()[:12]
+def digest(settings: Settings, baseline: CqlConfig | SacConfig | None = None) -> str:
+    """Some letters that tell settings apart, with those of a baseline."""
+    words = json.dumps(to_dict(settings), sort_keys=True)
+    words += json.dumps(asdict(baseline), sort_keys=True) if baseline else ""
+    return hashlib.sha256(words.encode()).hexdigest()[:12]
 
 
 def origin(made: dict[str, Any]) -> dict[str, Any]:
@@ -359,7 +360,7 @@ def baseline(
         policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
         mazes = join_mazes(run.mazes, run.eval_mazes).items()
         rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
-    return [made | row | outcomes(folder, row) for row in rows]
+    return [made | {"settings": digest(run.settings, config)} | row | outcomes(folder, row) for row in rows]
 
 
 # --------------------------------------------------------------------------------------------------------- results
@@ -367,7 +368,7 @@ def baseline(
 
 def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
     """Write lists of rows. Those in the file that were not measured anew, by other commands or earlier, stay, unless
-    they are of a variant that had other settings then."""
+    they are of a variant that had other settings then: of those it says that they go."""
 
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
@@ -383,7 +384,10 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
     for name in {**kept, **found}:
         rows = found.get(name, [])
         anew = {subject(row) for row in rows}
-        kept[name] = [row for row in kept.get(name, []) if holds(row) and subject(row) not in anew] + rows
+        before = [row for row in kept.get(name, []) if subject(row) not in anew]
+        for variant, seed in dict.fromkeys((row["variant"], row["model_seed"]) for row in before if not holds(row)):
+            print(f"{file}: {name} of {variant}, seed {seed}, were of other settings, and go", file=sys.stderr)
+        kept[name] = [row for row in before if holds(row)] + rows
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, kept)
 

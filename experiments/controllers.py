@@ -46,12 +46,19 @@ def ship(run: Path) -> None:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """A run's ``controller.json``, with its training's wall time [s] and, by iteration, success on held-out edges."""
+    """A run's ``controller.json``, with its training's wall time [s] and, by iteration, success on held-out edges.
+
+    Raises:
+        UserError: the run took over its controller from another.
+    """
+    from ct_envs import UserError
     from ct_jax.checkpoint import read_json
 
     found = read_json(run / "controller" / "controller.json")
     lines = map(json.loads, (run / "metrics.jsonl").read_text("utf-8").splitlines())
     tests = {line["step"]: line["held_out"] for line in lines if line["stage"] == "controller" and "held_out" in line}
+    if not tests:
+        raise UserError(f"{run}: its controller was learned in another run; give that one")
     wall_s = read_json(run / "controller" / "done.json")["wall_s"]
     return found | {"made": found["made"] | {"wall_s": wall_s, "curve": sorted(tests.items())}}
 

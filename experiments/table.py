@@ -59,12 +59,17 @@ def each_model(rows: list[dict[str, Any]]) -> str:
 
 
 def took(rows: list[dict[str, Any]]) -> str:
-    """How long the models took, and their trajectories."""
-    walls: dict[str, list[float]] = {}
+    """How long a model takes on each machine, in the mean of its seeds, and its trajectories."""
+    walls: dict[str, dict[str, dict[int, float]]] = {}
     timed = lambda row: row["method"] not in _BASELINES or "learn_wall_s" in row  # noqa: E731  # early rows have none
     for row in filter(timed, rows):
-        walls.setdefault(row["variant"], []).append(row["run_wall_s"] / 60)
-    words = "a model takes: " + ", ".join(f"{name} {np.mean(minutes):.0f} min" for name, minutes in walls.items())
+        seeds = walls.setdefault(row["hardware"], {}).setdefault(row["variant"], {})
+        seeds[row["model_seed"]] = row["run_wall_s"] / 60
+    each = {
+        machine: ", ".join(f"{name} {np.mean(list(seeds.values())):.0f} min" for name, seeds in variants.items())
+        for machine, variants in walls.items()
+    }
+    words = "; ".join(f"a model takes on {machine}: {times}" for machine, times in each.items())
     collecting = [row["collect_wall_s"] / 60 for row in rows if row.get("collect_wall_s")]
     if collecting:
         words += f" (of them, for the planning trajectories: {min(collecting):.1f} to {max(collecting):.1f})"
@@ -100,7 +105,8 @@ def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> 
         of_seed = {same(row): flags(row, "success") for row in together.get((seen, maze, untuned), ())}
         changes = [flags(row, "success") - of_seed[same(row)] for row in tuned if same(row) in of_seed]
         if changes:
-            lines += [f"{maze}: {name} less {untuned} {gain_of(changes)} of 100"]
+            models = f"{len(changes)} model" + "s" * (len(changes) > 1)
+            lines += [f"{maze}: {name} less {untuned} {gain_of(changes)} of 100 ({models})"]
     return ["", "; ".join(lines) + "."] if lines else []
 
 
@@ -163,21 +169,21 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
     """
     rows = results["rows"]
     marks = sorted({row["updates"] for row in rows})
-    names = ["robot", "run", "start", *(f"{mark}" for mark in marks), "90 % of the final at"]
+    names = ["robot", "run", "start", "seeds", *(f"{mark}" for mark in marks), "90 % of the final at"]
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    means: dict[tuple[str, str, str], list[float]] = {}
-    subject = lambda row: (row["robot"], row["run"], row["start"])  # noqa: E731
-    for start in dict.fromkeys(map(subject, rows)):
-        mine = [row for row in rows if subject(row) == start]
-        means[start] = [np.mean([r["success_rate"] for r in mine if r["updates"] == mark]) for mark in marks]
-    for (robot, run, start), curve in means.items():
-        enough = 0.9 * max(other[-1] for of, other in means.items() if of[:2] == (robot, run))
-        reached = _reached(marks, curve, enough)
+    curves: dict[tuple[str, str, str], dict[int, list[float]]] = {}
+    for row in sorted(rows, key=lambda row: row["updates"]):
+        curve = curves.setdefault((row["robot"], row["run"], row["start"]), {})
+        curve.setdefault(row["updates"], []).append(row["success_rate"])
+    for (robot, run, start), curve in curves.items():
+        means = {mark: float(np.mean(rates)) for mark, rates in curve.items()}
+        finals = [np.mean(other[max(other)]) for of, other in curves.items() if of[:2] == (robot, run)]
+        reached = _reached(list(means), list(means.values()), 0.9 * max(finals))
         how = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
-        cells = [robot, f"`{run}`", how, *(f"{100 * mean:.0f}" for mean in curve), reached]
+        shown = [f"{100 * means[mark]:.0f}" if mark in means else "" for mark in marks]
+        cells = [robot, f"`{run}`", how, str(len(curve[max(curve)])), *shown, reached]
         lines.append("| " + " | ".join(cells) + " |")
-    seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows}))
-    on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of seeds {seeds}"
+    on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of the seeds"
     return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
 
 
@@ -241,12 +247,12 @@ def finetuned_table(results: dict[str, Any]) -> list[str]:
     """One line for each robot, F-CT and maze: CT, F-CT and what lies between them, of the models of all seeds."""
     lines = ["| robot | F-CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 8 + "|"]
     rows = results["rows"]
-    subject = lambda row: (row["robot"], row["variant"].removesuffix("-ct"), row["maze"])  # noqa: E731
-    for robot, tuned, maze in dict.fromkeys(map(subject, rows)):
-        here = sorted((r for r in rows if subject(r) == (robot, tuned, maze)), key=lambda r: r["model_seed"])
+    subject = lambda row: (row["robot"], row["variant"].removesuffix("-ct"), row["maze"], row["episodes"])  # noqa: E731
+    for robot, tuned, maze, pairs in dict.fromkeys(map(subject, rows)):
+        here = sorted((r for r in rows if subject(r) == (robot, tuned, maze, pairs)), key=lambda r: r["model_seed"])
         before, after = ([r for r in here if r["variant"] == variant] for variant in (f"{tuned}-ct", tuned))
         changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
-        counts = [str(len(before)), str(before[0]["episodes"])]
+        counts = [str(len(before)), str(pairs)]
         rates = [pooled(before, "success"), pooled(after, "success")]
         lines.append("| " + " | ".join([robot, f"`{tuned}`", maze, *counts, *rates, gain_of(changes)]) + " |")
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
-from _variants import claim, origin, replace_rows
+from _variants import claim, digest_of, origin, replace_rows
 from matplotlib.figure import Figure
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
@@ -29,7 +29,7 @@ from ct_jax.evaluate import draw_pairs, evaluate
 from ct_jax.fit import Fit, fit, init_params
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.progress import Bar
-from ct_jax.run import provenance
+from ct_jax.run import provenance, random_mazes
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
 
@@ -49,7 +49,7 @@ class Options:
     """Robots to fit a transformer for, each with the trunk of the other."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the fits."""
-    marks: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1600)
+    marks: tuple[int, ...] = (50, 100, 200, 400, 800)
     """After how many updates to evaluate."""
     episodes: int = 100
     """Start-goal pairs."""
@@ -84,7 +84,8 @@ class Target:
         if not unseen:
             raise UserError(f"{run}: was evaluated in no maze but its own; train with --eval-maze")
         data = storage.load(run / "collect" / "trajectories.npz")
-        return Target(model, data, env, learner, stack_mazes(list(seen.values())), next(iter(unseen.items())))
+        mazes = stack_mazes([*seen.values(), *random_mazes(settings.random_mazes)])
+        return Target(model, data, env, learner, mazes, next(iter(unseen.items())))
 
 
 def curve(target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path) -> list[dict]:
@@ -129,10 +130,16 @@ def measure(options: Options) -> list[dict[str, Any]]:
         for seed in options.seeds:
             for start in ("scratch", "transfer"):
                 source = make(other).model if start == "transfer" else None
-                folder = options.out / f"{robot}-{runs[robot].name}" / f"{start}-{seed}"
-                of = {"robot": runs[robot], "other": runs[other], "episodes": options.episodes}
-                claim(folder / "curve.json", of, "runs or pairs")
                 head = {"robot": robot, "run": runs[robot].name, "start": other if source else "scratch", "seed": seed}
+                head["source"] = runs[other].name if source else None
+                folder = options.out / f"{robot}-{runs[robot].name}" / f"{start}-{seed}"
+                models = [make(robot).model, *([source] if source else [])]
+                # A fit goes on from the mark before: another mark among them would find a later one's weights.
+                of = {
+                    "models": [digest_of(model.policy.params) for model in models],
+                    "episodes": options.episodes, "marks": sorted(options.marks),
+                }  # fmt: skip
+                claim(folder / "curve.json", of, "runs, pairs or marks")
                 rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
     return rows
 
@@ -165,7 +172,7 @@ def main(options: Options) -> None:
     prepare_jax()
     rows = measure(options)
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    draw(replace_rows(RESULTS, rows, ("robot", "run", "start", "seed", "updates")), PICTURE)
+    draw(replace_rows(RESULTS, rows, ("robot", "run", "start", "source", "seed", "updates")), PICTURE)
     print(f"results: {RESULTS}\npicture: {PICTURE}")
 
 

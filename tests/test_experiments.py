@@ -300,9 +300,9 @@ def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
     ]
     lines = transfer_table({"rows": rows})
     assert (
-        lines[2] == "| point | `cpu-0` | from scratch | 0 | 30 | 90 | 90 |"
+        lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
     )  # 51 of 60 points of the way from 50 to 100
-    assert lines[3] == "| point | `cpu-0` | from the ant's trunk | 50 | 85 | 90 | 46 |"
+    assert lines[3] == "| point | `cpu-0` | from the ant's trunk | 1 | 50 | 85 | 90 | 46 |"
 
 
 def test_a_shipped_controller_says_how_it_was_learned(tiny_run):

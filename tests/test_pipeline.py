@@ -1,5 +1,6 @@
 """The pipeline: a run's folder, and that whatever stops it, the next one goes on as if nothing had."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -23,7 +24,7 @@ from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
 from ct_jax.model import load_model
 from ct_jax.presets import Settings
-from ct_jax.progress import Bar
+from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, load_mazes, maze_text, open_run, random_mazes
 
 pytestmark = pytest.mark.rank_promotion("allow")
@@ -127,6 +128,20 @@ def test_a_skill_stays_the_runs_controller_through_all_rounds(tiny_settings, tmp
     meant = (controller.normalizer.mean, controller.normalizer.std, controller.policy)
     jax.tree.map(np.testing.assert_array_equal, found, meant)
     assert "predict_action" not in trained.policy.params["params"]
+
+
+def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, tmp_path):
+    """Whatever comes to lie where it came from."""
+    source = tmp_path / "source"
+    shutil.copytree(tiny_run.folder / "controller", source / "controller")
+    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, controller=str(source)))
+    with open_run(run, resume=False), contextlib.closing(Metrics(run.folder)) as metrics:
+        given, _ = mazes.MazeCourse(run).controller(metrics)
+        shutil.rmtree(source)
+        again, _ = mazes.MazeCourse(run).controller(metrics)
+    jax.tree.map(np.testing.assert_array_equal, given, again)
+    done = run.done("controller")
+    assert done is not None and done["given"] == str(source)
 
 
 def test_the_random_mazes_are_always_the_same():
