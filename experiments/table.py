@@ -33,7 +33,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     names = ["maze", "method", "success %", "each model", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     together: dict[tuple[bool, str, str], list[dict[str, Any]]] = {}
-    for row in sorted(rows, key=lambda row: (not row["seen"], _place(row))):
+    for row in sorted(rows, key=lambda row: (not row["seen"], row["maze"], _place(row))):
         together.setdefault((row["seen"], row["maze"], method_name(row)), []).append(row)
     for (seen, maze, name), models in together.items():
         cells = [f"{maze} ({'seen' if seen else 'unseen'})", name, pooled(models, "success"), each_model(models)]
