@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,11 @@ class MazeCourse:
 
     def controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
         """The run's own controller, learned or taken over once from where it was given, and its configuration."""
+        controller, config = self._controller(metrics)
+        effort = self.run.settings.controller_effort * config.effort
+        return controller.replace(effort=effort), replace(config, effort=effort)
+
+    def _controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
         run, config = self.run, self.run.settings.sac
         if run.done("controller") is not None:
             return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))

@@ -23,6 +23,7 @@ class Settings:
     prm: PrmConfig = PrmConfig()
     controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
     sac: SacConfig = SacConfig()
+    controller_effort: float = 1.0  # of a learned controller's actions, when it leads: with less it falls less
     collect: CollectConfig = CollectConfig()
     model: ModelConfig = ModelConfig()
     value: ValueConfig = ValueConfig()
@@ -271,6 +272,7 @@ def get_preset(name: str, robot: str = "point") -> Settings:
 _LATER = {
     "rooms": None,
     "random_mazes": 0,
+    "controller_effort": 1.0,
     "modes": 1,
     "commitment": 0.0,
     "skill": False,

@@ -54,8 +54,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, memory, skill, mazes, and each of
-    them with -ct, which is without fine-tuning. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, calm, memory, skill and mazes, each
+    of them also with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -141,6 +141,8 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
             modes = replace(lifted.model, modes=4, commitment=0.0 if name else 3.0)
             variants[f"modes{name}"] = replace(base, model=modes)
+            # In three quarters of its range the ant's controller falls a third as often.
+            variants[f"calm{name}"] = replace(base, controller_effort=0.75)
             # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of
             # the point 16.
             memory = replace(lifted.model, stride=4 if robot == "humanoid" else 3)
@@ -176,7 +178,7 @@ def run_plan(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and evaluate everything with each seed, continuing what is there; returns all rows.
 
-    The references, planner and explorer, appear once for each roadmap's margin, which they keep, too.
+    The references, planner and explorer, appear once for each roadmap's margin, which they keep, too, and each effort.
 
     Args:
         keep: told all rows so far after each model.
@@ -199,7 +201,7 @@ def run_plan(
             else:
                 pipeline.train(run, resume=True)
                 found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
-            if margin(run) in map(margin, before):
+            if reference(run) in map(reference, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
@@ -207,9 +209,13 @@ def run_plan(
     return rows
 
 
-def margin(run: Run) -> float | None:
-    """What planner and explorer keep to walls in a run's mazes [m]; in rooms they have a setting of their own."""
-    return None if run.settings.rooms else run.settings.prm.margin_m
+def reference(run: Run) -> dict[str, float]:
+    """What tells a run's planner and explorer from those of other runs; in rooms they have a setting of their own."""
+    settings = run.settings
+    if settings.rooms:
+        return {}
+    effort = {"effort": settings.controller_effort} if settings.controller_effort != 1.0 else {}
+    return {"margin_m": settings.prm.margin_m} | effort
 
 
 def share(source: Run, run: Run) -> None:
@@ -220,8 +226,11 @@ def share(source: Run, run: Run) -> None:
         settings = run.settings
         if stage == "evaluate":  # in rooms, the references have a roadmap and a controller of their own
             found = settings.episodes, settings.pairs_seed, settings.rooms and settings.rooms.worlds
-            return found if settings.rooms else (*found, *made_of(run, "controller"))
+            return found if settings.rooms else (*found, settings.controller_effort, *made_of(run, "controller"))
         found = settings.prm, settings.controller, settings.sac, run.seed
+        if stage == "controller":
+            return found
+        found += (settings.controller_effort,)
         if stage in ("collect", "fit"):
             found += settings.collect, settings.rooms, settings.random_mazes
         return (*found, settings.model, settings.fit, settings.value) if stage == "fit" else found
@@ -245,9 +254,9 @@ def label(run: Run, variant: str, row: dict[str, Any]) -> dict[str, Any]:
     stages = [*sorted(run.folder.glob("*/done.json")), run.folder / "baselines" / row["method"] / "done.json"]
     walls = {done.parent.name: read_json(done)["wall_s"] for done in stages if done.is_file()}
     made = {"variant": variant, "model_seed": run.seed, "settings": digest(run.settings)}
-    if row["method"] in GUIDED and margin(run) is not None:
-        made["margin_m"] = margin(run)
-    if margin(run) is not None and row["method"] != "sac":  # which nothing led
+    if row["method"] in GUIDED:
+        made |= reference(run)
+    if not run.settings.rooms and row["method"] != "sac":  # which nothing led
         made["controller"] = controller_digest(str(run.folder), run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     if row["method"] in walls:
@@ -373,7 +382,12 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
         where = (row.get(name) for name in ("method", "maze", "density", "noise"))
-        return (*model, *where, row.get("margin_m") or 0.0)  # rows of earlier commits name none, and had none
+        return (
+            *model,
+            *where,
+            row.get("margin_m") or 0.0,
+            row.get("effort"),
+        )  # early rows name no margin, and had none
 
     kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
     now = {row["variant"]: row.get("settings") for rows in found.values() for row in rows}

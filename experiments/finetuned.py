@@ -33,7 +33,7 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Literal["cpu", "modes", "memory", "skill", "mazes"] = "cpu"
+    tuned: Literal["cpu", "calm", "modes", "memory", "skill", "mazes"] = "cpu"
     """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""

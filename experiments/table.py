@@ -18,7 +18,7 @@ from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
 # Variants of F-CT; before fine-tuning, each was the one with "-ct".
-_LIFTED = ("cpu", "modes", "memory", "skill", "mazes")
+_LIFTED = ("cpu", "calm", "modes", "memory", "skill", "mazes")
 FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]
@@ -80,7 +80,8 @@ def method_name(row: dict[str, Any]) -> str:
     """What the paper calls a row's method; of other variants, the name; of references, also their margin."""
     method, variant = str(row["method"]), str(row["variant"])
     if method in GUIDED:
-        return f"{method}, {row['margin_m']:g} m off walls" if row.get("margin_m") else method
+        kept = f", {row['margin_m']:g} m off walls" if row.get("margin_m") else ""
+        return f"{method}{kept}, {row['effort']:.0%} of the effort" if "effort" in row else f"{method}{kept}"
     if method != "ct":
         return _BASELINES.get(method, method)
     named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"} | {name: f"F-CT, `{name}`" for name in _LIFTED}

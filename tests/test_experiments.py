@@ -48,8 +48,8 @@ def test_the_methods_of_the_table(robot):
         "cpu",
         "mazes-ct",
         "mazes",
-        *["modes-ct", "memory-ct", *(["skill-ct"] if robot != "humanoid" else [])],  # whose cpu has it
-        *["modes", "memory", *(["skill"] if robot != "humanoid" else [])],
+        *["modes-ct", "calm-ct", "memory-ct", *(["skill-ct"] if robot != "humanoid" else [])],  # whose cpu has it
+        *["modes", "calm", "memory", *(["skill"] if robot != "humanoid" else [])],
     ]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
