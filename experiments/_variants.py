@@ -54,8 +54,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, calm, memory, skill and mazes, each
-    of them also with -ct, which is without fine-tuning. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, calm, memory, skill and mazes,
+    each of them also with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
