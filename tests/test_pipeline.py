@@ -134,14 +134,16 @@ def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, t
     """Whatever comes to lie where it came from."""
     source = tmp_path / "source"
     shutil.copytree(tiny_run.folder / "controller", source / "controller")
-    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, controller=str(source)))
+    settings = dataclasses.replace(tiny_settings, controller=str(source), controller_effort=0.5)
+    run = make_run(tmp_path / "run", settings)
     with open_run(run, resume=False), contextlib.closing(Metrics(run.folder)) as metrics:
-        given, _ = mazes.MazeCourse(run).controller(metrics)
+        given, config = mazes.MazeCourse(run).controller(metrics)
         shutil.rmtree(source)
         again, _ = mazes.MazeCourse(run).controller(metrics)
     jax.tree.map(np.testing.assert_array_equal, given, again)
     done = run.done("controller")
     assert done is not None and done["given"] == str(source)
+    assert given.effort == config.effort == 0.5 * tiny_settings.sac.effort
 
 
 def test_the_random_mazes_are_always_the_same():
