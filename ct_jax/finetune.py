@@ -149,7 +149,7 @@ def gather_recoveries(
     if config.keep not in KEEP:
         raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
     kept: list[Trajectories] = []
-    recoveries = episodes = 0
+    recoveries = episodes = falls = 0
     while recoveries < config.recoveries:
         if episodes >= config.give_up * config.recoveries:
             break
@@ -160,9 +160,11 @@ def gather_recoveries(
             rescued = rescued & (data.learn.sum(1) > 0)
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
         recoveries, episodes = recoveries + int(joined(rescued).sum()), episodes + envs
+        falls += int(joined(fell).sum())
         on_progress(recoveries, episodes)
     if not recoveries:
-        raise UserError(f"no recovery in {episodes} episodes; the policy hardly fails, so skip fine-tuning")
+        why = "it falls before it is helped" if 2 * falls > episodes else "the policy hardly fails"
+        raise UserError(f"no recovery in {episodes} episodes, {falls} falls: {why}, so skip fine-tuning")
     return concatenate(kept)
 
 

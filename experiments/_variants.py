@@ -182,11 +182,15 @@ def run_plan(
 
     Args:
         keep: told all rows so far after each model.
+
+    Raises:
+        UserError: runs that cannot be finished; the others are.
     """
     prepare_jax()
     seen, unseen = default_mazes(robot)
     rows: list[dict[str, Any]] = []
     before: list[Run] = []
+    failed: list[str] = []
     for seed in seeds:
         for name, settings in plan.variants.items():
             run = Run(
@@ -196,17 +200,28 @@ def run_plan(
             print(f"== {robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
             for other in before:
                 share(other, run)
-            if name in plan.baselines:
-                found = BASELINES[name](run, plan.baselines[name])
-            else:
-                pipeline.train(run, resume=True)
-                found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
+            try:
+                found = found_of(run, plan.baselines.get(name), name)
+            except UserError as bad:  # the others may yet come out
+                print(f"{run.folder}: {bad}", file=sys.stderr)
+                failed.append(f"{run.folder}: {bad}")
+                continue
             if reference(run) in map(reference, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
             keep(rows)
+    if failed:
+        raise UserError("; ".join(failed))
     return rows
+
+
+def found_of(run: Run, baseline: CqlConfig | SacConfig | None, name: str) -> list[dict[str, Any]]:
+    """Rows of one run, trained or learned unless it is finished."""
+    if baseline is not None:
+        return BASELINES[name](run, baseline)
+    pipeline.train(run, resume=True)
+    return [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
 
 
 def reference(run: Run) -> dict[str, float]:

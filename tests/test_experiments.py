@@ -150,6 +150,24 @@ def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeyp
     assert len(rows) == 2 * 3 + 2
 
 
+def test_a_run_that_cannot_be_finished_stops_no_other(tiny_settings, tmp_path, monkeypatch):
+    def found_of(run, baseline, name):
+        if name == "one":
+            raise UserError("no recovery")
+        return [{"method": "ct", "maze": "m"}]
+
+    monkeypatch.setattr("_variants.share", lambda source, run: None)
+    monkeypatch.setattr("_variants.found_of", found_of)
+    monkeypatch.setattr("_variants.label", lambda run, name, row: {"variant": name} | row)
+    kept = []
+    with pytest.raises(UserError, match="one-0: no recovery"):
+        run_plan(
+            "point", Plan(dict.fromkeys(("one", "two"), tiny_settings)), preset="tiny", seeds=(0,), out=tmp_path,
+            keep=kept.append,
+        )  # fmt: skip
+    assert [row["variant"] for row in kept[-1]] == ["two"]
+
+
 def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_path):
     def run(name, **changes):
         maze = load_mazes((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],))
