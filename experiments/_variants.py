@@ -141,7 +141,7 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
             # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
             modes = replace(lifted.model, modes=4, commitment=0.0 if name else 3.0)
             variants[f"modes{name}"] = replace(base, model=modes)
-            # In three quarters of its range the ant's controller falls a third as often.
+            # In three quarters of its range the ant hardly falls: chosen in the maze it is trained in.
             variants[f"calm{name}"] = replace(base, controller_effort=0.75)
             # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of
             # the point 16.
