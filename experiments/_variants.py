@@ -198,9 +198,9 @@ def run_plan(
                 mazes=load_mazes(seen), eval_mazes=load_mazes(unseen), seed=seed, engine=engine,
             )  # fmt: skip
             print(f"== {robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
-            for other in before:
-                share(other, run)
             try:
+                for other in before:
+                    share(other, run)
                 found = found_of(run, plan.baselines.get(name), name)
             except UserError as bad:  # the others may yet come out
                 print(f"{run.folder}: {bad}", file=sys.stderr)
@@ -397,12 +397,8 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
     def subject(row: dict[str, Any]) -> tuple[Any, ...]:
         model = () if row["method"] in GUIDED else (row["variant"], row["model_seed"])
         where = (row.get(name) for name in ("method", "maze", "density", "noise"))
-        return (
-            *model,
-            *where,
-            row.get("margin_m") or 0.0,
-            row.get("effort"),
-        )  # early rows name no margin, and had none
+        # Rows of earlier commits name no margin, and had none.
+        return (*model, *where, row.get("margin_m") or 0.0, row.get("effort"))
 
     kept: dict[str, list[dict[str, Any]]] = read_json(file) if file.is_file() else {}
     now = {row["variant"]: row.get("settings") for rows in found.values() for row in rows}

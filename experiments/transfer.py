@@ -108,8 +108,7 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
                     fit_key, target.learner, params, target.data, target.mazes, updates=mark, checkpoints=checkpoints,
                     on_progress=lambda update, loss: bar.update(update, f"loss {loss:.4f}"),
                 )  # fmt: skip
-                policy = replace(target.model.policy, params=params_now)
-                episodes = evaluate(target.env, maze, pairs, "ct", policy=policy)
+                episodes = evaluate(target.env, maze, pairs, "ct", policy=replace(policy, params=params_now))
                 row = {"updates": mark, "maze": name, "episodes": options.episodes} | episodes.summary()
                 write_json(file, row | origin(made))
             rows.append(read_json(file))

@@ -317,9 +317,8 @@ def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
         for mark, rate in zip((25, 50, 100), curve, strict=True)
     ]
     lines = transfer_table({"rows": rows})
-    assert (
-        lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
-    )  # 51 of 60 points of the way from 50 to 100
+    # 51 of 60 points of the way from 50 to 100
+    assert lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
     assert lines[3] == "| point | `cpu-0` | from the ant's trunk | 1 | 50 | 85 | 90 | 46 |"
 
 
