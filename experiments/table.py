@@ -174,18 +174,22 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
     lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
     curves: dict[tuple[str, str, str], dict[int, list[float]]] = {}
     for row in sorted(rows, key=lambda row: row["updates"]):
-        curve = curves.setdefault((row["robot"], row["run"], row["start"]), {})
+        curve = curves.setdefault((row["robot"], row["run"], start_of(row)), {})
         curve.setdefault(row["updates"], []).append(row["success_rate"])
     for (robot, run, start), curve in curves.items():
         means = {mark: float(np.mean(rates)) for mark, rates in curve.items()}
         finals = [np.mean(other[max(other)]) for of, other in curves.items() if of[:2] == (robot, run)]
         reached = _reached(list(means), list(means.values()), 0.9 * max(finals))
-        how = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
         shown = [f"{100 * means[mark]:.0f}" if mark in means else "" for mark in marks]
-        cells = [robot, f"`{run}`", how, str(len(curve[max(curve)])), *shown, reached]
+        cells = [robot, f"`{run}`", start, str(len(curve[max(curve)])), *shown, reached]
         lines.append("| " + " | ".join(cells) + " |")
     on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of the seeds"
     return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+
+
+def start_of(row: dict[str, Any]) -> str:
+    """What a curve of the transfer began with, in words."""
+    return "from scratch" if row["source"] is None else f"from the trunk of the {row['start']}'s {row['source']}"
 
 
 def _reached(marks: list[int], curve: list[float], enough: float) -> str:

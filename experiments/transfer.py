@@ -10,6 +10,7 @@ robot's model (``ct_jax.transfer``), and tried on the run's pairs in the unseen 
 
 import functools
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 import tyro
 from _variants import claim, digest_of, origin, replace_rows
 from matplotlib.figure import Figure
+from table import start_of
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
 from ct_envs.maze import make_maze, parse_walls
@@ -150,14 +152,17 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
     axes = figure.subplots(1, len(subjects), sharey=True, squeeze=False)[0]
     for ax, subject in zip(axes, subjects, strict=True):
         mine = [row for row in rows if (row["robot"], row["run"]) == subject]
-        for start, colour in zip(sorted({row["start"] for row in mine}), ("#1b6ca8", "#c8400e"), strict=False):
-            marks = sorted({row["updates"] for row in mine})
-            values = [
-                [100 * r["success_rate"] for r in mine if (r["start"], r["updates"]) == (start, mark)] for mark in marks
-            ]
-            name = "from scratch" if start == "scratch" else f"from the {start}'s trunk"
-            ax.plot(marks, [np.mean(v) for v in values], marker="o", color=colour, label=name)
-            ax.fill_between(marks, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+        for start, colour in zip(sorted({*map(start_of, mine)}), cycle(("#c8400e", "#1b6ca8", "#3a7d44"))):
+            rates: dict[int, list[float]] = {}
+            for row in mine:
+                if start_of(row) == start:
+                    rates.setdefault(row["updates"], []).append(100 * row["success_rate"])
+            at = sorted(rates)
+            ax.plot(at, [np.mean(rates[mark]) for mark in at], marker="o", color=colour, label=start)
+            ax.fill_between(
+                at, [min(rates[mark]) for mark in at], [max(rates[mark]) for mark in at], color=colour, alpha=0.15
+            )
+        marks = sorted({row["updates"] for row in mine})
         ax.set(title=", ".join(subject), xlabel="updates", xscale="log", ylim=(0, 100))
         ax.set_xticks(marks, map(str, marks))
         ax.minorticks_off()

@@ -312,14 +312,16 @@ def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
     made = MADE | {"episodes": 100}
     curves = {("scratch", 0): (0.0, 0.2, 0.8), ("scratch", 1): (0.0, 0.4, 1.0), ("ant", 0): (0.5, 0.85, 0.9)}
     rows = [
-        {"robot": "point", "run": "cpu-0", "start": start, "seed": seed, "updates": mark, "success_rate": rate} | made
+        {"robot": "point", "run": "cpu-0", "start": start, "source": None if start == "scratch" else "cpu-0"}
+        | {"seed": seed, "updates": mark, "success_rate": rate}
+        | made
         for (start, seed), curve in curves.items()
         for mark, rate in zip((25, 50, 100), curve, strict=True)
     ]
     lines = transfer_table({"rows": rows})
     # 51 of 60 points of the way from 50 to 100
     assert lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
-    assert lines[3] == "| point | `cpu-0` | from the ant's trunk | 1 | 50 | 85 | 90 | 46 |"
+    assert lines[3] == "| point | `cpu-0` | from the trunk of the ant's cpu-0 | 1 | 50 | 85 | 90 | 46 |"
 
 
 def test_a_shipped_controller_says_how_it_was_learned(tiny_run):

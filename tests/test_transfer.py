@@ -76,6 +76,10 @@ def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path)
     assert experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 4, "point": tmp_path}, "") == claimed
     with pytest.raises(UserError, match="other runs or pairs"):
         experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 5, "point": tmp_path}, "runs or pairs")
-    both = [{"robot": robot, "run": "cpu-0", "start": "scratch"} | row for robot in ("ant", "point") for row in rows]
+    both = [
+        {"robot": robot, "run": "cpu-0", "start": "scratch", "source": None} | row
+        for robot in ("ant", "point")
+        for row in rows
+    ]
     experiment.draw(both, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 0
