@@ -42,6 +42,7 @@ from ct_jax.run import (
 
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
+LIFTS = ("modes", "calm", "memory", "skill", "calm+memory")  # rows besides ``cpu``'s, of which each adds to it
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
 
@@ -54,8 +55,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, modes, calm, memory, skill and mazes,
-    each of them also with -ct, which is without fine-tuning. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill and
+    calm+memory, each of them also with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -136,21 +137,28 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants["cpu-ct"] = replace(lifted, rounds=0, fit=replace(lifted.last_fit, shift_timestep=300))
         variants["cpu"] = lifted
         variants |= _of_many_mazes(lifted)
-        for name in ("-ct", ""):
-            base = variants[f"cpu{name}"]
-            # Keeping to a mode is for those who have learned from their own mistakes: CT keeps to it into walls.
-            modes = replace(lifted.model, modes=4, commitment=0.0 if name else 3.0)
-            variants[f"modes{name}"] = replace(base, model=modes)
-            # In three quarters of its range the ant hardly falls: chosen in the maze it is trained in.
-            variants[f"calm{name}"] = replace(base, controller_effort=0.75)
-            # As many steps remembered, but farther apart: of the humanoid ``cpu``'s are 4 m of way, of the ant 6, of
-            # the point 16.
-            memory = replace(lifted.model, stride=4 if robot == "humanoid" else 3)
-            variants[f"memory{name}"] = replace(base, model=memory)
-            if not lifted.model.skill:
-                skilled = replace(base, model=replace(lifted.model, skill=True))
-                variants[f"skill{name}"] = with_fits(skilled, turns=frame == "heading")  # of one controller one gait
+        for name in LIFTS:
+            if "skill" not in name.split("+") or not lifted.model.skill:  # which the humanoid has as it is
+                variants[f"{name}-ct"] = _lift(name, robot, variants["cpu-ct"])
+                variants[name] = _lift(name, robot, lifted)
     return Plan(variants, baselines)
+
+
+def _lift(names: str, robot: str, settings: Settings) -> Settings:
+    """What is tried besides; of several, one after the other."""
+    for name in names.split("+"):
+        model = settings.model
+        if name == "modes":  # Keeping to a mode is for those who have learned from their own mistakes, not for CT.
+            settings = replace(settings, model=replace(model, modes=4, commitment=3.0 if settings.rounds else 0.0))
+        elif name == "calm":  # In three quarters of its range the ant hardly falls: chosen in its training maze.
+            settings = replace(settings, controller_effort=0.75)
+        elif name == "memory":  # As many steps remembered, but farther apart: a step is 0.1 m of the ant's way.
+            settings = replace(settings, model=replace(model, stride=4 if robot == "humanoid" else 3))
+        else:
+            assert name == "skill"
+            settings = replace(settings, model=replace(model, skill=True))
+            settings = with_fits(settings, turns=model.frame == "heading")  # of one controller one gait
+    return settings
 
 
 def _of_many_mazes(lifted: Settings) -> dict[str, Settings]:

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _variants import LIFTS
 
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
 # Variants of F-CT; before fine-tuning, each was the one with "-ct".
-_LIFTED = ("cpu", "calm", "modes", "memory", "skill", "mazes")
+_LIFTED = ("cpu", *LIFTS, "mazes")
 FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]

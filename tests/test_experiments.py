@@ -38,19 +38,10 @@ def fits_of(settings):
 @pytest.mark.parametrize("robot", ["point", "ant", "humanoid"])
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
-    assert list(plan.variants) == [
-        "published",
-        "bc",
-        "f-ct",
-        "pt-cql",
-        "sac",
-        "cpu-ct",
-        "cpu",
-        "mazes-ct",
-        "mazes",
-        *["modes-ct", "calm-ct", "memory-ct", *(["skill-ct"] if robot != "humanoid" else [])],  # whose cpu has it
-        *["modes", "calm", "memory", *(["skill"] if robot != "humanoid" else [])],
-    ]
+    skill = ["skill"] if robot != "humanoid" else []  # whose cpu has it
+    lifts = ["cpu", "mazes", "modes", "calm", "memory", *skill, "calm+memory"]
+    lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
+    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted]
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
@@ -72,6 +63,7 @@ def test_the_methods_of_the_table(robot):
         assert found == with_fits(replace(one, model=replace(one.model, skill=True)), turns=robot != "point")
     for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.stride > 1
+        assert plan.variants[f"calm+{name}"] == replace(plan.variants[name], controller_effort=0.75)
     assert plan.variants["modes"].model.commitment > plan.variants["modes-ct"].model.commitment == 0.0
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
