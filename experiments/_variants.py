@@ -42,7 +42,7 @@ from ct_jax.run import (
 
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
-LIFTS = ("modes", "calm", "memory", "skill", "calm+memory")  # rows besides ``cpu``'s, of which each adds to it
+LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill")  # rows besides ``cpu``, with more
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
 
@@ -55,8 +55,8 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill and
-    calm+memory, each of them also with -ct, which is without fine-tuning. By default all."""
+    """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill,
+    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None

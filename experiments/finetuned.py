@@ -33,7 +33,7 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Literal["cpu", "mazes", "modes", "calm", "memory", "skill", "calm+memory"] = "cpu"
+    tuned: Literal["cpu", "mazes", "modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill"] = "cpu"
     """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""

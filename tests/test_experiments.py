@@ -39,7 +39,16 @@ def fits_of(settings):
 def test_the_methods_of_the_table(robot):
     plan = plan_for(robot, "cpu", controller="own")
     skill = ["skill"] if robot != "humanoid" else []  # whose cpu has it
-    lifts = ["cpu", "mazes", "modes", "calm", "memory", *skill, "calm+memory"]
+    lifts = [
+        "cpu",
+        "mazes",
+        "modes",
+        "calm",
+        "memory",
+        *skill,
+        "calm+memory",
+        *[f"calm+memory+{name}" for name in skill],
+    ]
     lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
     assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted]
     assert list(plan.baselines) == ["pt-cql", "sac"]
