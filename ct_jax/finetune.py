@@ -35,6 +35,7 @@ class RecoverConfig:
     takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
     keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
     # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
+    random_mazes: int = 0  # so many mazes of a generator to fail and recover in, besides the run's
     give_up: float = 20.0  # stop after this many times T episodes
 
 

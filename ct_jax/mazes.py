@@ -66,7 +66,7 @@ class MazeCourse:
         del folder
         config = self.run.settings.collect
         env = self.run.env(maps=False, auto_reset=False, horizon=config.horizon)
-        prm, mazes = self.run.settings.prm, self.run.stacked
+        prm, mazes = self.run.settings.prm, self.run.stack(self.run.settings.random_mazes)
         return collect(key, env, mazes, controller, config, prm, on_progress=on_progress)
 
     def recover(

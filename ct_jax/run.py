@@ -65,10 +65,13 @@ class Run:
 
     @property
     def stacked(self) -> Maze | None:
-        """The training mazes along a leading axis, if it has any: the named ones, then those of the generator."""
-        if not self.mazes:
-            return None
-        return stack_mazes([*self.mazes.values(), *random_mazes(self.settings.random_mazes)])
+        """The mazes that its data may be in along a leading axis, if any: the named ones, then the generator's."""
+        settings = self.settings
+        return self.stack(max(settings.random_mazes, settings.recover.random_mazes)) if self.mazes else None
+
+    def stack(self, besides: int) -> Maze:
+        """The named training mazes, and so many of the generator's."""
+        return stack_mazes([*self.mazes.values(), *random_mazes(besides)])
 
     def done(self, stage: str) -> dict[str, Any] | None:
         """What the finished stage said of itself; None if it has not finished."""

@@ -42,7 +42,7 @@ from ct_jax.run import (
 
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
-LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill")  # rows besides ``cpu``, with more
+LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam")  # ``cpu`` with
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
 
@@ -56,7 +56,8 @@ class Options:
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
     """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill,
-    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning. By default all."""
+    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning; roam and modes+roam,
+    which are cpu-ct and modes-ct before it. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -139,9 +140,15 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants |= _of_many_mazes(lifted)
         for name in LIFTS:
             if "skill" not in name.split("+") or not lifted.model.skill:  # which the humanoid has as it is
-                variants[f"{name}-ct"] = _lift(name, robot, variants["cpu-ct"])
+                if "roam" not in name:
+                    variants[f"{name}-ct"] = _lift(name, robot, variants["cpu-ct"])
                 variants[name] = _lift(name, robot, lifted)
     return Plan(variants, baselines)
+
+
+def untuned(name: str) -> str:
+    """The variant that a fine-tuned one is before fine-tuning, which alone needs other mazes."""
+    return "+".join([part for part in name.split("+") if part != "roam"] or ["cpu"]) + "-ct"
 
 
 def _lift(names: str, robot: str, settings: Settings) -> Settings:
@@ -154,6 +161,8 @@ def _lift(names: str, robot: str, settings: Settings) -> Settings:
             settings = replace(settings, controller_effort=0.75)
         elif name == "memory":  # As many steps remembered, but farther apart: a step is 0.1 m of the ant's way.
             settings = replace(settings, model=replace(model, stride=4 if robot == "humanoid" else 3))
+        elif name == "roam":  # CT of the one maze, which looks for its failures elsewhere.
+            settings = replace(settings, recover=replace(settings.recover, random_mazes=100))
         else:
             assert name == "skill"
             settings = replace(settings, model=replace(model, skill=True))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from _variants import RESULTS, digest_of, origin, replace_rows
+from _variants import RESULTS, digest_of, origin, replace_rows, untuned
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
@@ -33,7 +33,9 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Literal["cpu", "mazes", "modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill"] = "cpu"
+    tuned: Literal[
+        "cpu", "mazes", "modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam"
+    ] = "cpu"
     """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
@@ -70,7 +72,7 @@ def main(options: Options) -> None:
     prepare_jax()
     for seed in options.seeds:
         for maze in options.maze:
-            variants = (f"{options.tuned}-ct", options.tuned)
+            variants = (untuned(options.tuned), options.tuned)
             before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before["controller"] != after["controller"]:
                 raise UserError(f"the models of seed {seed} were led by different controllers")

@@ -13,17 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _variants import LIFTS
+from _variants import LIFTS, untuned
 
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
 # Variants of F-CT; before fine-tuning, each was the one with "-ct".
 _LIFTED = ("cpu", *LIFTS, "mazes")
-FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{name}-ct`" for name in _LIFTED}  # and what it was before
+FINE_TUNED = {"F-CT": "CT"} | {
+    f"F-CT, `{name}`": f"CT, `{untuned(name)}`" for name in _LIFTED
+}  # and what it was before
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]
-_ORDER += [name for tuned, before in list(FINE_TUNED.items())[1:] for name in (before, tuned)]
+_ORDER += dict.fromkeys(name for tuned, ct in list(FINE_TUNED.items())[1:] for name in (ct, tuned))
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
@@ -253,10 +255,15 @@ def finetuned_table(results: dict[str, Any]) -> list[str]:
     """One line for each robot, F-CT and maze: CT, F-CT and what lies between them, of the models of all seeds."""
     lines = ["| robot | F-CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 8 + "|"]
     rows = results["rows"]
-    subject = lambda row: (row["robot"], row["variant"].removesuffix("-ct"), row["maze"], row["episodes"])  # noqa: E731
+    subject = lambda row: (row["robot"], row["variant"], row["maze"], row["episodes"])  # noqa: E731
+    model = lambda row: (row["model_seed"], row["controller"])  # noqa: E731
     for robot, tuned, maze, pairs in dict.fromkeys(map(subject, rows)):
-        here = sorted((r for r in rows if subject(r) == (robot, tuned, maze, pairs)), key=lambda r: r["model_seed"])
-        before, after = ([r for r in here if r["variant"] == variant] for variant in (f"{tuned}-ct", tuned))
+        if tuned.endswith("-ct"):
+            continue
+        first = {model(row): row for row in rows if subject(row) == (robot, untuned(tuned), maze, pairs)}
+        here = sorted((row for row in rows if subject(row) == (robot, tuned, maze, pairs)), key=model)
+        after = [row for row in here if model(row) in first]
+        before = [first[model(row)] for row in after]
         changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
         counts = [str(len(before)), str(pairs)]
         rates = [pooled(before, "success"), pooled(after, "success")]

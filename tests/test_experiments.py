@@ -11,7 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from _variants import Plan, digest, plan_for, run_plan, share, write_results
+from _variants import Plan, digest, plan_for, run_plan, share, untuned, write_results
 from controllers import described, minutes, table
 from table import differences, finetuned_table, interval_of_mean, method_name, pooled, room_table, transfer_table
 from turtlebot3 import variants_for
@@ -50,7 +50,10 @@ def test_the_methods_of_the_table(robot):
         *[f"calm+memory+{name}" for name in skill],
     ]
     lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
-    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted]
+    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted, "roam", "modes+roam"]
+    for name in ("roam", "modes+roam"):  # a CT of the one maze, which looks for its failures in others, too
+        tuned, ct = plan.variants[name], plan.variants[untuned(name)]
+        assert tuned.recover.random_mazes > 0 == tuned.random_mazes == ct.random_mazes and tuned.collect == ct.collect
     assert list(plan.baselines) == ["pt-cql", "sac"]
     assert all(plan.variants[name] == plan.variants["published"] for name in plan.baselines)  # the same data
     published, bc, fct = (plan.variants[name] for name in ("published", "bc", "f-ct"))
@@ -298,6 +301,7 @@ def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
 def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart():
     def row(variant, seed, successes):
         head = {"robot": "point", "maze": "m", "variant": variant, "model_seed": seed, "seed": 1, "episodes": 4}
+        head["controller"] = "one"
         rates = {"success_rate": successes.count("1") / 4, "outcomes": {"success": successes}}
         return head | rates | MADE | {"trained": MADE}
 
@@ -307,6 +311,9 @@ def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart()
     assert [line[1:5] for line in lines] == [["`mazes`", "m", "2", "4"], ["`cpu`", "m", "1", "4"]]
     assert [line[-1].split()[0] for line in lines] == ["+12.5", "+100.0"]
     assert finetuned_table({"rows": [*one, *many]})[3] == finetuned_table({"rows": [*many, *one]})[2]  # in any order
+    roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # of whose CT, cpu-ct, there is no seed 1
+    (line,) = (line for line in finetuned_table({"rows": [*one, *roaming]}) if "roam" in line)
+    assert line.split(" | ")[3] == "1" and "+75.0" in line
 
 
 def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():

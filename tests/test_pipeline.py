@@ -117,6 +117,21 @@ def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(ti
     assert {row["maze"] for row in pipeline.results(run.folder)} == {"antmaze-umaze"}
 
 
+def test_failures_are_looked_for_in_other_mazes_than_the_plans_are_of(tiny_settings, tmp_path):
+    collecting = dataclasses.replace(tiny_settings.collect, reset_interval=2)
+    recovering = dataclasses.replace(tiny_settings.recover, random_mazes=3, keep="relabelled")
+    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, collect=collecting, recover=recovering))
+    pipeline.train(run)
+    plans, recoveries = (
+        storage.load(run.folder / name) for name in ("collect/trajectories.npz", "finetune/trajectories-1.npz")
+    )
+    assert plans.maze.max() == 0 < recoveries.maze.max() <= 3
+    walls, cell_m = np.asarray(run.stacked.walls), 4.0
+    for i in range(recoveries.n):
+        column, row = np.floor(recoveries.position[i, : recoveries.length[i]] / cell_m).astype(int).T
+        assert not walls[recoveries.maze[i], row, column].any()
+
+
 @pytest.mark.rank_promotion("allow")  # brax's running statistics
 def test_a_skill_stays_the_runs_controller_through_all_rounds(tiny_settings, tmp_path):
     model = dataclasses.replace(tiny_settings.model, skill=True)
