@@ -42,7 +42,9 @@ from ct_jax.run import (
 
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
-LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam")  # ``cpu`` with
+# What is tried besides ``cpu``, and the variants of F-CT; ``untuned`` is what each was before.
+LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam")
+TUNED = ("cpu", *LIFTS, "mazes")
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
 
@@ -140,8 +142,7 @@ def _whole_plan(robot: str, preset: str, *, controller: str) -> Plan:
         variants |= _of_many_mazes(lifted)
         for name in LIFTS:
             if "skill" not in name.split("+") or not lifted.model.skill:  # which the humanoid has as it is
-                if "roam" not in name:
-                    variants[f"{name}-ct"] = _lift(name, robot, variants["cpu-ct"])
+                variants.setdefault(untuned(name), _lift(name, robot, variants["cpu-ct"]))  # who roams has one already
                 variants[name] = _lift(name, robot, lifted)
     return Plan(variants, baselines)
 

@@ -11,10 +11,10 @@ tables' are of seed 0. Writes ``experiments/results/finetuned.json``.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import tyro
-from _variants import RESULTS, digest_of, origin, replace_rows, untuned
+from _variants import RESULTS, TUNED, digest_of, origin, replace_rows, untuned
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
@@ -25,6 +25,10 @@ from ct_jax.run import provenance
 
 FILE = RESULTS / "finetuned.json"
 PAIRS_SEED = 1
+if TYPE_CHECKING:
+    Tuned = str
+else:  # so that --help lists them
+    Tuned = tyro.extras.literal_type_from_choices(TUNED)
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,7 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Literal[
-        "cpu", "mazes", "modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam"
-    ] = "cpu"
+    tuned: Tuned = "cpu"
     """Which F-CT to compare with its CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""

@@ -13,16 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _variants import LIFTS, untuned
+from _variants import TUNED, untuned
 
 from ct_jax.evaluate import GUIDED, wilson_of
 
 ROOT = Path(__file__).parents[1]
-# Variants of F-CT; before fine-tuning, each was the one with "-ct".
-_LIFTED = ("cpu", *LIFTS, "mazes")
-FINE_TUNED = {"F-CT": "CT"} | {
-    f"F-CT, `{name}`": f"CT, `{untuned(name)}`" for name in _LIFTED
-}  # and what it was before
+# Names of F-CT, and of what each was before fine-tuning.
+FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{untuned(name)}`" for name in TUNED}
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]
 _ORDER += dict.fromkeys(name for tuned, ct in list(FINE_TUNED.items())[1:] for name in (ct, tuned))
@@ -87,7 +84,7 @@ def method_name(row: dict[str, Any]) -> str:
         return f"{method}{kept}, {row['effort']:.0%} of the effort" if "effort" in row else f"{method}{kept}"
     if method != "ct":
         return _BASELINES.get(method, method)
-    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"} | {name: f"F-CT, `{name}`" for name in _LIFTED}
+    named = {"published": "CT", "bc": "BC-CT", "f-ct": "F-CT"} | {name: f"F-CT, `{name}`" for name in TUNED}
     return named.get(variant, f"CT, `{variant}`")
 
 
@@ -98,24 +95,30 @@ def _place(row: dict[str, Any]) -> int:
 
 
 def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
-    """F-CT less CT in each maze, as published and lifted, pair by pair and model by model, led by one controller."""
-
-    def same(row: dict[str, Any]) -> tuple[Any, ...]:
-        return row["model_seed"], row.get("controller")
-
+    """F-CT less CT in each maze, as published and lifted, pair by pair and model by model."""
     lines = []
     for (seen, maze, name), tuned in together.items():
-        untuned = FINE_TUNED.get(name, "")
-        of_seed = {same(row): flags(row, "success") for row in together.get((seen, maze, untuned), ())}
-        changes = [flags(row, "success") - of_seed[same(row)] for row in tuned if same(row) in of_seed]
-        if changes:
-            models = f"{len(changes)} model" + "s" * (len(changes) > 1)
-            lines += [f"{maze}: {name} less {untuned} {gain_of(changes)} of 100 ({models})"]
+        before = FINE_TUNED.get(name, "")
+        models = of_one_model(together.get((seen, maze, before), []), tuned)
+        if models:
+            count = f"{len(models)} model" + "s" * (len(models) > 1)
+            lines += [f"{maze}: {name} less {before} {gain_of(models)} of 100 ({count})"]
     return ["", "; ".join(lines) + "."] if lines else []
 
 
-def gain_of(changes: list[np.ndarray]) -> str:
-    """The mean of several models' changes, pair by pair, in percent with its interval."""
+def of_one_model(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> list[tuple[dict[str, Any], ...]]:
+    """The rows of F-CT that have one of CT, each after it: of one seed, led by one controller."""
+
+    def model(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["model_seed"], row.get("controller")
+
+    first = {model(row): row for row in before}
+    return [(first[model(row)], row) for row in after if model(row) in first]
+
+
+def gain_of(models: list[tuple[dict[str, Any], ...]]) -> str:
+    """What fine-tuning adds to the success of several models, pair by pair, in percent with its interval."""
+    changes = [flags(after, "success") - flags(before, "success") for before, after in models]
     low, high = interval_of_mean(np.stack(changes))
     return f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
 
@@ -256,18 +259,15 @@ def finetuned_table(results: dict[str, Any]) -> list[str]:
     lines = ["| robot | F-CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 8 + "|"]
     rows = results["rows"]
     subject = lambda row: (row["robot"], row["variant"], row["maze"], row["episodes"])  # noqa: E731
-    model = lambda row: (row["model_seed"], row["controller"])  # noqa: E731
-    for robot, tuned, maze, pairs in dict.fromkeys(map(subject, rows)):
-        if tuned.endswith("-ct"):
-            continue
-        first = {model(row): row for row in rows if subject(row) == (robot, untuned(tuned), maze, pairs)}
-        here = sorted((row for row in rows if subject(row) == (robot, tuned, maze, pairs)), key=model)
-        after = [row for row in here if model(row) in first]
-        before = [first[model(row)] for row in after]
-        changes = [flags(a, "success") - flags(b, "success") for b, a in zip(before, after, strict=True)]
-        counts = [str(len(before)), str(pairs)]
-        rates = [pooled(before, "success"), pooled(after, "success")]
-        lines.append("| " + " | ".join([robot, f"`{tuned}`", maze, *counts, *rates, gain_of(changes)]) + " |")
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in sorted(rows, key=lambda row: row["model_seed"]):
+        found.setdefault(subject(row), []).append(row)
+    for robot, tuned, maze, pairs in dict.fromkeys(subject(row) for row in rows if row["variant"] in TUNED):
+        models = of_one_model(found.get((robot, untuned(tuned), maze, pairs), []), found[robot, tuned, maze, pairs])
+        if models:
+            rates = [pooled(list(those), "success") for those in zip(*models, strict=True)]
+            cells = [robot, f"`{tuned}`", maze, str(len(models)), str(pairs), *rates, gain_of(models)]
+            lines.append("| " + " | ".join(cells) + " |")
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
     on = f"pairs of seed {rows[0]['seed']}"
     return [*lines, "", f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}."]
