@@ -23,6 +23,10 @@ from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, con
 KEEP = ("separate", "joined", "relabelled")
 
 
+class NoRecoveryError(UserError):
+    """There is nothing to fine-tune on: the planner saves none of a policy's episodes, or hardly one wants it."""
+
+
 @dataclass(frozen=True)
 class RecoverConfig:
     """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's where it gives any."""
@@ -111,7 +115,8 @@ def recover(
         With ``keep="separate"`` two trajectories for each recovery, otherwise one.
 
     Raises:
-        UserError: no recovery within ``give_up * T`` episodes, or a ``keep`` that means nothing.
+        NoRecoveryError: no recovery within ``give_up * T`` episodes.
+        UserError: a ``keep`` that means nothing.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     first_maze = int(jax.random.randint(key, (), 0, len(mazes.cell_m)))  # where there are many, each round in others
@@ -145,7 +150,7 @@ def gather_recoveries(
             which fell.
 
     Raises:
-        UserError: as ``recover``.
+        UserError: as ``recover``, NoRecoveryError included.
     """
     if config.keep not in KEEP:
         raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
@@ -165,7 +170,7 @@ def gather_recoveries(
         on_progress(recoveries, episodes)
     if not recoveries:
         why = "it falls before it is helped" if 2 * falls > episodes else "the policy hardly fails"
-        raise UserError(f"no recovery in {episodes} episodes, {falls} falls: {why}, so skip fine-tuning")
+        raise NoRecoveryError(f"no recovery in {episodes} episodes, {falls} falls: {why}, so skip fine-tuning")
     return concatenate(kept)
 
 

@@ -25,6 +25,7 @@ from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
+from ct_jax.finetune import NoRecoveryError
 from ct_jax.mazes import evaluated
 from ct_jax.model import load_controller
 from ct_jax.presets import Settings, get_preset, to_dict, with_fits
@@ -78,7 +79,7 @@ def experiment(robot: str, about: str | None) -> int:
         file = RESULTS / f"{robot}-{options.preset}.json"
         run_plan(
             robot, plan, preset=options.preset, seeds=options.seeds, out=out, engine=options.engine,
-            keep=lambda rows: write_results(file, {"rows": rows}),
+            keep=lambda found: write_results(file, found),
         )  # fmt: skip
         show_results(file)
 
@@ -192,14 +193,16 @@ def _of_many_mazes(lifted: Settings) -> dict[str, Settings]:
 
 def run_plan(
     robot: str, plan: Plan, *, preset: str, seeds: tuple[int, ...], out: Path, engine: str = "auto",
-    keep: Callable[[list[dict[str, Any]]], None] = lambda rows: None,
+    keep: Callable[[dict[str, list[dict[str, Any]]]], None] = lambda found: None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and evaluate everything with each seed, continuing what is there; returns all rows.
+
+    F-CT that finds nothing to learn from is a result, too: of it there is not a row but the reason.
 
     The references, planner and explorer, appear once for each roadmap's margin, which they keep, too, and each effort.
 
     Args:
-        keep: told all rows so far after each model.
+        keep: told all "rows" so far after each model, and the reasons of those "unmade".
 
     Raises:
         UserError: runs that cannot be finished; the others are.
@@ -207,6 +210,7 @@ def run_plan(
     prepare_jax()
     seen, unseen = default_mazes(robot)
     rows: list[dict[str, Any]] = []
+    unmade: list[dict[str, Any]] = []
     before: list[Run] = []
     failed: list[str] = []
     for seed in seeds:
@@ -222,13 +226,17 @@ def run_plan(
                 found = found_of(run, plan.baselines.get(name), name)
             except UserError as bad:  # the others may yet come out
                 print(f"{run.folder}: {bad}", file=sys.stderr)
-                failed.append(f"{run.folder}: {bad}")
+                if isinstance(bad, NoRecoveryError):
+                    unmade.append(label(run, name, {"method": "ct", "why": str(bad)}))
+                    keep({"rows": rows, "unmade": unmade})
+                else:
+                    failed.append(f"{run.folder}: {bad}")
                 continue
             if reference(run) in map(reference, before):
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
-            keep(rows)
+            keep({"rows": rows, "unmade": unmade})
     if failed:
         raise UserError("; ".join(failed))
     return rows
@@ -431,6 +439,9 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
         for variant, seed in dict.fromkeys((row["variant"], row["model_seed"]) for row in before if not holds(row)):
             print(f"{file}: {name} of {variant}, seed {seed}, were of other settings, and go", file=sys.stderr)
         kept[name] = [row for row in before if holds(row)] + rows
+    made = {(row["variant"], row["model_seed"]) for row in found.get("rows", [])}
+    if "unmade" in kept:
+        kept["unmade"] = [row for row in kept["unmade"] if (row["variant"], row["model_seed"]) not in made]
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, kept)
 

@@ -41,12 +41,21 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
         cells += [f"{np.mean([row['return_scaled'] for row in models]):.1f}", pooled(models, "collision")]
         cells += [pooled(models, "fall")] if falls else []
         lines.append("| " + " | ".join(cells) + " |")
-    lines += differences(together)
+    lines += differences(together) + reasons(results.get("unmade", []))
     pairs = {(row["episodes"], row["seed"]) for row in rows}
     on = "; ".join(f"{n} pairs of seed {seed}" for n, seed in sorted(pairs))
     seeds = ", ".join(str(seed) for seed in sorted({row["model_seed"] for row in rows}))
     note = f"{commands(rows)}; {on} in each maze; models of seeds {seeds}; {_INTERVALS}; {origin(rows)}"
     return [*lines, "", f"{note}; {took(rows)}."]
+
+
+def reasons(unmade: list[dict[str, Any]]) -> list[str]:
+    """Why methods have no row."""
+    told = [
+        f"{method_name(row)}, seed {row['model_seed']}: {row['why']} ({commands([row])}; {origin([row])})"
+        for row in unmade
+    ]
+    return ["", f"Without a row: {'; '.join(told)}."] if told else []
 
 
 def each_model(rows: list[dict[str, Any]]) -> str:

@@ -93,7 +93,7 @@ def run_all(options: Options) -> Path:
     variants = variants_for(options.preset, options.variants)
     run_plan(
         "turtlebot3", Plan(variants), preset=options.preset, seeds=options.seeds, out=options.out,
-        keep=lambda rows: write_results(file, {"rows": rows}),
+        keep=lambda found: write_results(file, found),
     )  # fmt: skip
     swept = {name: SWEPT.get(name, SWEEPS) for name in variants if name in SWEPT or name == options.preset}
     for name, kinds in swept.items() if options.sweeps else ():

@@ -13,7 +13,16 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 from _variants import Plan, digest, plan_for, run_plan, share, untuned, write_results
 from controllers import described, minutes, table
-from table import differences, finetuned_table, interval_of_mean, method_name, pooled, room_table, transfer_table
+from table import (
+    differences,
+    finetuned_table,
+    interval_of_mean,
+    method_name,
+    pooled,
+    reasons,
+    room_table,
+    transfer_table,
+)
 from turtlebot3 import variants_for
 
 from ct_envs import MazeEnv, UserError
@@ -22,6 +31,7 @@ from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.checkpoint import read_json
 from ct_jax.controllers.sac import SacConfig
+from ct_jax.finetune import NoRecoveryError
 from ct_jax.presets import get_preset, with_fits
 from ct_jax.run import Run, load_mazes
 
@@ -157,19 +167,44 @@ def test_references_appear_once_for_each_margin(tiny_settings, tmp_path, monkeyp
 def test_a_run_that_cannot_be_finished_stops_no_other(tiny_settings, tmp_path, monkeypatch):
     def found_of(run, baseline, name):
         if name == "one":
-            raise UserError("no recovery")
+            raise UserError("full disk")
         return [{"method": "ct", "maze": "m"}]
 
     monkeypatch.setattr("_variants.share", lambda source, run: None)
     monkeypatch.setattr("_variants.found_of", found_of)
     monkeypatch.setattr("_variants.label", lambda run, name, row: {"variant": name} | row)
     kept = []
-    with pytest.raises(UserError, match="one-0: no recovery"):
+    with pytest.raises(UserError, match="one-0: full disk"):
         run_plan(
             "point", Plan(dict.fromkeys(("one", "two"), tiny_settings)), preset="tiny", seeds=(0,), out=tmp_path,
             keep=kept.append,
         )  # fmt: skip
-    assert [row["variant"] for row in kept[-1]] == ["two"]
+    assert [row["variant"] for row in kept[-1]["rows"]] == ["two"] and not kept[-1]["unmade"]
+
+
+def test_f_ct_that_finds_nothing_to_learn_from_is_a_result(tiny_settings, tmp_path, monkeypatch):
+    """The others go on, the reason stands in the results until there is a row, and under the table."""
+
+    def found_of(run, baseline, name):
+        if name == "f-ct":
+            raise NoRecoveryError("no recovery in 9 episodes")
+        return [{"method": "ct", "maze": "m"}]
+
+    made = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created": "2026-01-01T00"}
+    monkeypatch.setattr("_variants.share", lambda source, run: None)
+    monkeypatch.setattr("_variants.found_of", found_of)
+    monkeypatch.setattr("_variants.label", lambda run, name, row: row | made | {"variant": name, "model_seed": 0})
+    file = tmp_path / "results.json"
+    plan = Plan(dict.fromkeys(("f-ct", "published"), tiny_settings))
+    run_plan(
+        "point", plan, preset="tiny", seeds=(0,), out=tmp_path, keep=lambda found: write_results(file, found)
+    )  # fmt: skip
+    found = read_json(file)
+    assert [row["variant"] for row in found["rows"]] == ["published"]
+    told = "\n".join(reasons(found["unmade"]))
+    assert "Without a row: F-CT, seed 0: no recovery in 9 episodes (`python x.py`; commit abc" in told
+    write_results(file, {"rows": [{"variant": "f-ct", "model_seed": 0, "method": "ct", "maze": "m"}]})
+    assert read_json(file)["unmade"] == reasons([]) == []
 
 
 def test_variants_share_what_would_come_out_alike(tiny_run, tiny_settings, tmp_path):

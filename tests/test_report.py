@@ -212,9 +212,11 @@ def test_a_run_without_failures_says_so(make_run):
 def test_random_mazes_are_mentioned(make_run, besides, said):
     run = make_run()
     config = json.loads((run / "config.json").read_text())
-    config["settings"]["random_mazes"] = besides
+    config["settings"] |= {"random_mazes": besides, "recover": {"random_mazes": besides}}
     (run / "config.json").write_text(json.dumps(config))
-    assert ("trained in 100 random mazes besides" in to_html(reading.read_run(run))) == said
+    page = to_html(reading.read_run(run))
+    assert ("trained in 100 random mazes besides" in page) == said
+    assert ("looked for its failures in 100 random mazes" in page) == said
 
 
 def test_the_same_run_gives_the_same_page(make_run):

@@ -232,16 +232,24 @@ def _mazes(run: Run) -> str:
         svg = pictures.to_svg(figure, f"{'' if rooms else 'Maze '}{name}, {size}{note}.")
         figures.append(_figure(svg, name, size + note, _seen_tag(run.seen.get(name, False))))
     lead = "The planner knows these maps. The transformer never sees one: only the walls around it."
-    settings = run.config.get("settings")
-    besides = settings.get("random_mazes") if isinstance(settings, dict) else None
-    if isinstance(besides, int) and besides:
+    if besides := _random_mazes(run):
         lead += f" It was trained in {words.count(besides, 'random maze')} besides."
+    if besides := _random_mazes(run, "recover"):
+        lead += f" It looked for its failures in {words.count(besides, 'random maze')}, too."
     lead = f'<p class="quiet">{lead}</p>'
     more = len(run.walls) - len(figures)
     rest = f'<p class="quiet">{words.count(more, "further " + ("room" if rooms else "maze"))} not drawn.</p>'
     rest = rest if more else ""
     missing = "" if run.roadmap or rooms else _missing("No roadmap", "prm/roadmap.npz")
     return _section(title, lead, _grid(figures, "wide"), rest, missing)
+
+
+def _random_mazes(run: Run, *stage: str) -> int:
+    """How many random mazes a run's settings, or those of a stage of it, name; damaged ones name none."""
+    found: object = run.config.get("settings")
+    for key in (*stage, "random_mazes"):
+        found = found.get(key) if isinstance(found, dict) else None
+    return found if isinstance(found, int) else 0
 
 
 def _trajectories(run: Run) -> str:
