@@ -9,6 +9,7 @@ the results file without ``.json``.
 import json
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,55 @@ FINE_TUNED = {"F-CT": "CT"} | {f"F-CT, `{name}`": f"CT, `{untuned(name)}`" for n
 _BASELINES = {"pt-cql": "PT-CQL", "sac": "SAC alone"}
 _ORDER = ["CT", "BC-CT", "F-CT", *_BASELINES.values()]
 _ORDER += dict.fromkeys(name for tuned, ct in list(FINE_TUNED.items())[1:] for name in (ct, tuned))
+# Success of the paper's CT [%], sec. IV; and what lifts ours, without and with fine-tuning.
+_PAPER = {
+    "point": {"antmaze-large": 84.33, "antmaze-large-eval": 60.33},
+    "ant": {"antmaze-large": 90.0, "antmaze-large-eval": 77.33},
+    "humanoid": {"antmaze-large": 19.0, "antmaze-large-eval": 18.0, "hall": 26.0},
+    "turtlebot3": {"rooms": 92.47},
+}
+_BOTH = ("cpu-ct", "cpu")
+_LIFTED = {"ant": ("calm-ct", "cpu")}
 _INTERVALS = "95 % intervals, of several models over models and pairs"
+
+
+def summary_table(results: dict[str, dict[str, Any]]) -> list[str]:
+    """One line for each robot and maze: the paper's CT, ours, and the planner that knows the map; success alone."""
+    names = [
+        "robot",
+        "maze",
+        "CT, paper",
+        "CT as published, small",
+        "CT, lifted",
+        "F-CT, lifted",
+        "planner with the map",
+    ]
+    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    for robot, mazes in _PAPER.items():
+        ct, tuned = _LIFTED.get(robot, _BOTH)
+        for maze, paper in mazes.items():
+            rows = [row for row in results.get(robot, {}).get("rows", []) if row["maze"] == maze]
+            own = [row for row in rows if row["method"] == "ct"]
+            cells = [
+                _mean(row for row in own if row["variant"] in those) for those in (("published", "ct"), [ct], [tuned])
+            ]
+            planners = sorted((r for r in rows if r["method"] == "planner"), key=lambda r: r["variant"] != ct)
+            where = f"{maze} ({'seen' if rows and rows[0]['seen'] else 'unseen'})"
+            lines.append("| " + " | ".join([robot, where, f"{paper:g}", *cells, _mean(planners[:1])]) + " |")
+    others = ", ".join(f"of the {robot} `{ct}` and `{tuned}`" for robot, (ct, tuned) in _LIFTED.items())
+    note = (
+        f"Success in %, and of how many trained models it is the mean. Lifted are `{'` and `'.join(_BOTH)}`, {others}."
+    )
+    return [*lines, "", note]
+
+
+def _mean(rows: Iterable[dict[str, Any]]) -> str:
+    """The mean success of models [%], and how many they are; of a reference alone."""
+    rows = list(rows)
+    if not rows:
+        return "not measured"
+    count = "" if rows[0]["method"] in GUIDED else f" ({len(rows)})"
+    return f"{100 * np.mean([row['success_rate'] for row in rows]):.1f}{count}"
 
 
 def experiment_table(results: dict[str, Any]) -> list[str]:
@@ -314,14 +363,20 @@ def put(text: str, name: str, lines: list[str]) -> str:
     return marked.sub(lambda m: m[1] + "\n".join(lines) + "\n" + m[2], text)
 
 
+def with_tables(text: str) -> str:
+    """The text of README.md with the tables of all results."""
+    files = sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")])
+    found = {file.stem: json.loads(file.read_text("utf-8")) for file in files}
+    text = put(text, "summary", summary_table({robot: found.get(f"{robot}-cpu", {}) for robot in _PAPER}))
+    for name, data in found.items():
+        text = put(text, name, _table(name, data))
+    return text
+
+
 def main() -> int:
     """Rewrite README.md."""
     readme = ROOT / "README.md"
-    text = readme.read_text("utf-8")
-    for file in sorted([*ROOT.glob("experiments/results/*.json"), *ROOT.glob("benchmarks/results/*.json")]):
-        data = json.loads(file.read_text("utf-8"))
-        text = put(text, file.stem, _table(file.stem, data))
-    readme.write_text(text, "utf-8")
+    readme.write_text(with_tables(readme.read_text("utf-8")), "utf-8")
     return 0
 
 

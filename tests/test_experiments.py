@@ -21,7 +21,9 @@ from table import (
     pooled,
     reasons,
     room_table,
+    summary_table,
     transfer_table,
+    with_tables,
 )
 from turtlebot3 import variants_for
 
@@ -374,3 +376,19 @@ def test_a_shipped_controller_says_how_it_was_learned(tiny_run):
     assert minutes(found)[-1][0] == pytest.approx(found["made"]["wall_s"] / 60)
     (line,) = table([found])[2:]
     assert f"| {100 * curve[-1][1]:.1f} |" in line and found["made"]["command"] in line
+
+
+def test_the_readme_shows_what_was_measured():
+    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    assert with_tables(text) == text
+
+
+def test_the_summary_is_of_all_models_and_of_the_planner_that_led_them():
+    def row(variant, seed, success, method="ct"):
+        where = {"maze": "antmaze-large", "seen": True}
+        return {"variant": variant, "model_seed": seed, "success_rate": success, "method": method} | where
+
+    planners = [row("published", 0, 0.5, "planner"), row("calm-ct", 0, 0.9, "planner")]
+    models = [row("calm-ct", 0, 0.6), row("calm-ct", 1, 0.8), row("cpu-ct", 0, 0.1), row("pt-cql", 0, 0.2, "pt-cql")]
+    lines = summary_table({"ant": {"rows": [*planners, *models]}})
+    assert "| ant | antmaze-large (seen) | 90 | not measured | 70.0 (2) | not measured | 90.0 |" in lines
