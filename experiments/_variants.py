@@ -44,7 +44,17 @@ from ct_jax.run import (
 RESULTS = Path(__file__).parent / "results"
 SHARED = ("controller", "collect", "fit")  # stages that several variants may have in common
 # What is tried besides ``cpu``, and the variants of F-CT; ``untuned`` is what each was before.
-LIFTS = ("modes", "calm", "memory", "skill", "calm+memory", "calm+memory+skill", "roam", "modes+roam")
+LIFTS = (
+    "modes",
+    "calm",
+    "memory",
+    "skill",
+    "calm+memory",
+    "calm+memory+skill",
+    "roam",
+    "modes+roam",
+    "modes+memory+roam",
+)
 TUNED = ("cpu", *LIFTS, "mazes")
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
@@ -59,8 +69,8 @@ class Options:
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
     """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill,
-    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning; roam and modes+roam,
-    which are cpu-ct and modes-ct before it. By default all."""
+    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning; roam, modes+roam and
+    modes+memory+roam, which are cpu-ct, modes-ct and modes+memory-ct before it. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None

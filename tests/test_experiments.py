@@ -62,8 +62,9 @@ def test_the_methods_of_the_table(robot):
         *[f"calm+memory+{name}" for name in skill],
     ]
     lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
-    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted, "roam", "modes+roam"]
-    for name in ("roam", "modes+roam"):  # a CT of the one maze, which looks for its failures in others, too
+    roaming = ["roam", "modes+roam", "modes+memory-ct", "modes+memory+roam"]
+    assert list(plan.variants) == ["published", "bc", "f-ct", "pt-cql", "sac", *lifted, *roaming]
+    for name in ("roam", "modes+roam", "modes+memory+roam"):  # CT of the one maze, failures of many
         tuned, ct = plan.variants[name], plan.variants[untuned(name)]
         assert tuned.recover.random_mazes > 0 == tuned.random_mazes == ct.random_mazes and tuned.collect == ct.collect
     assert list(plan.baselines) == ["pt-cql", "sac"]
