@@ -221,6 +221,7 @@ def run_plan(
     seen, unseen = default_mazes(robot)
     rows: list[dict[str, Any]] = []
     unmade: list[dict[str, Any]] = []
+    results = {"rows": rows, "unmade": unmade}
     before: list[Run] = []
     failed: list[str] = []
     for seed in seeds:
@@ -238,7 +239,7 @@ def run_plan(
                 print(f"{run.folder}: {bad}", file=sys.stderr)
                 if isinstance(bad, NoRecoveryError):
                     unmade.append(label(run, name, {"method": "ct", "why": str(bad)}))
-                    keep({"rows": rows, "unmade": unmade})
+                    keep(results)
                 else:
                     failed.append(f"{run.folder}: {bad}")
                 continue
@@ -246,7 +247,7 @@ def run_plan(
                 found = [row for row in found if row["method"] not in GUIDED]
             rows += [label(run, name, row) for row in found]
             before.append(run)
-            keep({"rows": rows, "unmade": unmade})
+            keep(results)
     if failed:
         raise UserError("; ".join(failed))
     return rows
@@ -449,8 +450,8 @@ def write_results(file: Path, found: dict[str, list[dict[str, Any]]]) -> None:
         for variant, seed in dict.fromkeys((row["variant"], row["model_seed"]) for row in before if not holds(row)):
             print(f"{file}: {name} of {variant}, seed {seed}, were of other settings, and go", file=sys.stderr)
         kept[name] = [row for row in before if holds(row)] + rows
-    made = {(row["variant"], row["model_seed"]) for row in found.get("rows", [])}
-    if "unmade" in kept:
+    if "unmade" in kept:  # what has rows now needs no reason any more
+        made = {(row["variant"], row["model_seed"]) for row in found.get("rows", [])}
         kept["unmade"] = [row for row in kept["unmade"] if (row["variant"], row["model_seed"]) not in made]
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, kept)
