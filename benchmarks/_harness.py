@@ -1,6 +1,7 @@
 """What all benchmarks share: contestants timed in turn, a table, ``results/NAME.json``, the table in the docstring.
 
-The table at the end of a benchmark's docstring is made from its results and nothing else.
+The table at the end of a benchmark's docstring is made from its results on a CPU and nothing else; those of an
+accelerator are in ``results/NAME-gpu.json`` alone.
 """
 
 import ast
@@ -154,7 +155,11 @@ class Results:
         print(table_of(rows))
         if self.options.write:
             RESULTS.mkdir(exist_ok=True)
-            (RESULTS / f"{self.file.stem}.json").write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+            on_cpu = jax.default_backend() == "cpu"
+            file = RESULTS / f"{self.file.stem}{'' if on_cpu else '-gpu'}.json"
+            file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+            if not on_cpu:
+                return
             self.file.write_text(with_table(self.file.read_text("utf-8"), table_of(rows)), "utf-8")
 
 

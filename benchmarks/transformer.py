@@ -59,15 +59,19 @@ class TransformerOptions(Options):
     """Work of a call, at least (100 times that on an accelerator)."""
     preset: str = "paper"
     """Of the models."""
+    float32: bool = True
+    """Also in float32, which on a CPU is all there is."""
 
 
 def main(options: TransformerOptions) -> None:
     """Run and print."""
     results = Results(__file__, options)
     torch = has_peer("torch", PEER) and has_peer("transformers", PEER)
+    on_gpu = jax.default_backend() == "gpu"
     for robot in options.robots:
-        measure(robot, "float32", "xla", torch, options, results)
-        if jax.default_backend() == "gpu":
+        if options.float32 or not on_gpu:
+            measure(robot, "float32", "xla", torch, options, results)
+        if on_gpu:
             # cuDNN wants even numbers of tokens
             for attention in ("xla", "cudnn") if robot == "ant" else ("xla",):
                 measure(robot, "bfloat16", attention, torch, options, results)

@@ -51,6 +51,7 @@ LIFTS = (
     "skill",
     "calm+memory",
     "calm+memory+skill",
+    "calm+long",
     "roam",
     "modes+roam",
     "modes+memory+roam",
@@ -69,8 +70,8 @@ class Options:
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
     """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill,
-    calm+memory and calm+memory+skill, each of them also with -ct, which is without fine-tuning; roam, modes+roam and
-    modes+memory+roam, which are cpu-ct, modes-ct and modes+memory-ct before it. By default all."""
+    calm+memory, calm+memory+skill and calm+long, each of them also with -ct, which is without fine-tuning; roam,
+    modes+roam and modes+memory+roam, which are cpu-ct, modes-ct and modes+memory-ct before it. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""
     out: Path | None = None
@@ -173,6 +174,8 @@ def _lift(names: str, robot: str, settings: Settings) -> Settings:
             settings = replace(settings, controller_effort=0.75)
         elif name == "memory":  # As many steps remembered, but farther apart: a step is 0.1 m of the ant's way.
             settings = replace(settings, model=replace(model, stride=4 if robot == "humanoid" else 3))
+        elif name == "long":  # The last training, which of CT is the only one, takes twice the updates.
+            settings = _twice_as_long(settings)
         elif name == "roam":  # CT of the one maze, which looks for its failures elsewhere.
             settings = replace(settings, recover=replace(settings.recover, random_mazes=100))
         else:
@@ -180,6 +183,13 @@ def _lift(names: str, robot: str, settings: Settings) -> Settings:
             settings = replace(settings, model=replace(model, skill=True))
             settings = with_fits(settings, turns=model.frame == "heading")  # of one controller one gait
     return settings
+
+
+def _twice_as_long(settings: Settings) -> Settings:
+    """The settings with twice the updates in the last training of the transformer."""
+    name = "last_fit" if settings.rounds else "fit"
+    fit = getattr(settings, name)
+    return replace(settings, **{name: replace(fit, updates=2 * fit.updates)})
 
 
 def _of_many_mazes(lifted: Settings) -> dict[str, Settings]:

@@ -96,6 +96,16 @@ def test_the_docstring_holds_the_table_of_the_results(tmp_path, monkeypatch):
     assert about(docstring) == "What it does.\n\n    python it.py"
 
 
+def test_an_accelerator_has_a_file_of_its_own(tmp_path, monkeypatch):
+    """And the table in the docstring stays that of a CPU."""
+    monkeypatch.setattr(_harness.jax, "default_backend", lambda: "gpu")
+    race = results(tmp_path, monkeypatch)
+    race.add("a step", "ms", [1.0])
+    race.finish()
+    assert [file.name for file in (tmp_path / "results").iterdir()] == ["it-gpu.json"]
+    assert (tmp_path / "it.py").read_text() == SOURCE
+
+
 def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
     race = results(tmp_path, monkeypatch, write=False)
     race.add("a", "ms", [1.0])

@@ -60,6 +60,7 @@ def test_the_methods_of_the_table(robot):
         *skill,
         "calm+memory",
         *[f"calm+memory+{name}" for name in skill],
+        "calm+long",
     ]
     lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
     roaming = ["roam", "modes+roam", "modes+memory-ct", "modes+memory+roam"]
@@ -89,6 +90,10 @@ def test_the_methods_of_the_table(robot):
     for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
         assert replace(plan.variants[name], model=one.model) == one and plan.variants[name].model.stride > 1
         assert plan.variants[f"calm+{name}"] == replace(plan.variants[name], controller_effort=0.75)
+    for name in ("calm-ct", "calm"):
+        one, longer = plan.variants[name], plan.variants[name.replace("calm", "calm+long")]
+        assert fits_of(longer)[-1 if one.rounds else 0].updates == 2 * fits_of(one)[-1 if one.rounds else 0].updates
+        assert replace(longer, fit=one.fit, last_fit=one.last_fit) == one
     assert plan.variants["modes"].model.commitment > plan.variants["modes-ct"].model.commitment == 0.0
     SacAlone(MazeEnv(robot, engine="mujoco"), replace(plan.baselines["sac"], replay=2000))  # its settings are for it
 
