@@ -125,9 +125,11 @@ def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Traje
 
 
 def flop(model: ControlTransformer, params: Any, window: Window) -> float:
-    """Floating-point operations of one gradient of the loss, as XLA counts them."""
+    """Floating-point operations of one gradient of the loss, as XLA counts them for a CPU: for a GPU it does not."""
     gradient = jax.jit(jax.grad(transformer_loss(model)))
-    return float(gradient.lower(params, window, jax.random.key(0)).cost_analysis()["flops"])  # pyright: ignore
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (params, window, jax.random.key(0)))
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        return float(gradient.lower(*shapes).cost_analysis()["flops"])  # pyright: ignore
 
 
 def matrix_product(side: int, dtype: str, step_flop: float) -> Contestant:
