@@ -108,20 +108,23 @@ def find(folder: Path, benchmark: str, name: str, unit: str) -> dict[str, Any]:
     rows = json.loads(file.read_text("utf-8")) if file.is_file() else []
     found = next((row for row in rows if (row["name"], row["unit"]) == (name, unit)), None)
     if found is None:
-        raise UserError(f"{file.name} has no row '{name}' in {unit}; run: python benchmarks/{benchmark}.py")
+        script = f"benchmarks/{benchmark.removesuffix('-gpu')}.py"
+        raise UserError(f"{file.name} has no row '{name}' in {unit}; run: python {script}")
     return found
 
 
 def measured(options: ScaleOptions, samples: int) -> Measured:
     """All rows that are needed. Raises UserError."""
     row, robot = options.results, options.robot
+    on_gpu = (row / "transformer-gpu.json").is_file()
+    trained, update = ("transformer-gpu", f"{robot}, bfloat16") if on_gpu else ("transformer", f"{robot}, float32")
     return Measured(
         find(
             row, "rollout", f"{robot}, collection guided by {get_preset('cpu', robot).collect.guide}", "trajectories/s"
         ),
         find(row, "prm", f"{samples} samples: build and table", "ms"),
-        find(row, "transformer", f"{robot}, float32", "steps/s"),
-        find(row, "transformer", f"{robot}, float32", "GFLOP/s"),
+        find(row, trained, update, "steps/s"),
+        find(row, trained, update, "GFLOP/s"),
     )
 
 

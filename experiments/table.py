@@ -54,25 +54,23 @@ def summary_table(results: dict[str, dict[str, Any]]) -> list[str]:
             rows = [row for row in results.get(robot, {}).get("rows", []) if row["maze"] == maze]
             own = [row for row in rows if row["method"] == "ct"]
             cells = [
-                _mean(row for row in own if row["variant"] in those) for those in (("published", "ct"), [ct], [tuned])
+                _together(row for row in own if row["variant"] in those)
+                for those in (("published", "ct"), [ct], [tuned])
             ]
             planners = sorted((r for r in rows if r["method"] == "planner"), key=lambda r: r["variant"] != ct)
             where = f"{maze} ({'seen' if rows and rows[0]['seen'] else 'unseen'})"
-            lines.append("| " + " | ".join([robot, where, f"{paper:g}", *cells, _mean(planners[:1])]) + " |")
+            lines.append("| " + " | ".join([robot, where, f"{paper:g}", *cells, _together(planners[:1])]) + " |")
     others = ", ".join(f"of the {robot} `{ct}` and `{tuned}`" for robot, (ct, tuned) in _LIFTED.items())
-    note = (
-        f"Success in %, and of how many trained models it is the mean. Lifted are `{'` and `'.join(_BOTH)}`, {others}."
-    )
+    note = f"Success in % with its 95 % interval, of n trained models. Lifted are `{'` and `'.join(_BOTH)}`, {others}."
     return [*lines, "", note]
 
 
-def _mean(rows: Iterable[dict[str, Any]]) -> str:
-    """The mean success of models [%], and how many they are; of a reference alone."""
+def _together(rows: Iterable[dict[str, Any]]) -> str:
+    """The success of models together with its interval [%], and how many they are; of a reference alone."""
     rows = list(rows)
     if not rows:
         return "not measured"
-    count = "" if rows[0]["method"] in GUIDED else f" ({len(rows)})"
-    return f"{100 * np.mean([row['success_rate'] for row in rows]):.1f}{count}"
+    return pooled(rows, "success") + ("" if rows[0]["method"] in GUIDED else f", n = {len(rows)}")
 
 
 def experiment_table(results: dict[str, Any]) -> list[str]:

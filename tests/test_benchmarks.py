@@ -201,6 +201,17 @@ def test_the_page_is_computed_from_what_was_measured(tmp_path):
     assert page.count("| memory of a GPU |") == 3 and "## What breaks first" in page and "nan" not in page
 
 
+def test_an_update_that_a_gpu_was_measured_at_is_taken_from_there(tmp_path):
+    options = scale_options(tmp_path, **MEASURED)
+    made = {"hardware": "1 x NVIDIA, x86_64 CPU, 16 cores", "commit": "0"}
+    rows = [
+        {"name": "point, bfloat16", "unit": unit, "value": value, "made": made}
+        for unit, value in (("steps/s", 200.0), ("GFLOP/s", 9.0))
+    ]
+    (tmp_path / "transformer-gpu.json").write_text(json.dumps(rows))
+    assert scale.update_s(scale.measured(options, 200), scale.Assumed()) == 1 / 200.0
+
+
 def test_more_hosts_hold_less_and_say_more(tmp_path):
     """Memory, computation and roadmaps shrink as hosts grow, traffic does not."""
     options = scale_options(tmp_path, **MEASURED)
