@@ -391,10 +391,15 @@ def test_the_readme_shows_what_was_measured():
 
 def test_the_summary_is_of_all_models_and_of_the_planner_that_led_them():
     def row(variant, seed, success, method="ct"):
-        where = {"maze": "antmaze-large", "seen": True}
+        where = {"maze": "antmaze-large", "seen": True, "episodes": 100}
         return {"variant": variant, "model_seed": seed, "success_rate": success, "method": method} | where
 
-    planners = [row("published", 0, 0.5, "planner"), row("calm-ct", 0, 0.9, "planner")]
-    models = [row("calm-ct", 0, 0.6), row("calm-ct", 1, 0.8), row("cpu-ct", 0, 0.1), row("pt-cql", 0, 0.2, "pt-cql")]
-    lines = summary_table({"ant": {"rows": [*planners, *models]}})
-    assert "| ant | antmaze-large (seen) | 90 | not measured | 70.0 (2) | not measured | 90.0 |" in lines
+    ct = "calm+long-ct"
+    planners = [row("published", 0, 0.5, "planner"), row(ct, 0, 0.9, "planner")]
+    models = [row(ct, 0, 0.6), row(ct, 1, 0.8), row("cpu-ct", 0, 0.1), row("pt-cql", 0, 0.2, "pt-cql")]
+    results = {"ant-cpu": {"rows": [*planners, *models]}, "ant-paper": {"rows": [row("published", 0, 0.3)]}}
+    (line,) = (line for line in summary_table(results) if line.startswith("| ant | antmaze-large (seen) | 90 |"))
+    _, small, full, lifted, tuned, planner = line.removesuffix(" |").split(" | ")[2:]
+    assert small == tuned == "not measured"
+    assert re.fullmatch(r"70\.0 \(6\d to 7\d\), n = 2", lifted) and re.fullmatch(r"30\.0 .*, n = 1", full)
+    assert re.fullmatch(r"90\.0 \(8\d to 9\d\)", planner)
