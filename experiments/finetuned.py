@@ -78,7 +78,7 @@ def main(options: Options) -> None:
             before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before["controller"] != after["controller"]:
                 raise UserError(f"the models of seed {seed} were led by different controllers")
-            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed"))
+            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"))
             print_rows([row | {"method": row["variant"]} for row in (before, after)])
 
 
