@@ -51,6 +51,7 @@ LIFTS = (
     "skill",
     "calm+memory",
     "calm+memory+skill",
+    "long",
     "calm+long",
     "roam",
     "modes+roam",
@@ -70,7 +71,7 @@ class Options:
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
     """Rows to run: published, bc, f-ct, pt-cql, sac; with preset cpu also cpu, mazes, modes, calm, memory, skill,
-    calm+memory, calm+memory+skill and calm+long, each of them also with -ct, which is without fine-tuning; roam,
+    calm+memory, calm+memory+skill, long and calm+long, each of them also with -ct, which is without fine-tuning; roam,
     modes+roam and modes+memory+roam, which are cpu-ct, modes-ct and modes+memory-ct before it. By default all."""
     controller: str = "own"
     """own, zoo, or a run folder."""

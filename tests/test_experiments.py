@@ -60,6 +60,7 @@ def test_the_methods_of_the_table(robot):
         *skill,
         "calm+memory",
         *[f"calm+memory+{name}" for name in skill],
+        "long",
         "calm+long",
     ]
     lifted = [name for lift in lifts for name in (f"{lift}-ct", lift)]
