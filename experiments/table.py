@@ -31,7 +31,7 @@ _PAPER = {
     "turtlebot3": {"rooms": 92.47},
 }
 _BOTH = ("cpu-ct", "cpu")
-_LIFTED = {"ant": ("calm+long-ct", "cpu")}
+_LIFTED = {"point": ("cpu-ct", "roam"), "ant": ("calm+long-ct", "cpu")}
 _INTERVALS = "95 % intervals, of several models over models and pairs"
 
 
