@@ -58,6 +58,7 @@ LIFTS = (
     "modes+memory+roam",
 )
 TUNED = ("cpu", *LIFTS, "mazes")
+LONGER = "long-ct"  # of one maze, and of about as many updates as F-CT in all
 ALONE = 8000  # iterations of SAC alone: of the point, 500 whole episodes
 
 

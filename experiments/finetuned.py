@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
-from _variants import RESULTS, TUNED, digest_of, origin, replace_rows, untuned
+from _variants import LONGER, RESULTS, TUNED, digest_of, origin, replace_rows, untuned
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
@@ -39,6 +39,8 @@ class Options:
     """point, ant or humanoid."""
     tuned: Tuned = "cpu"
     """Which F-CT to compare with its CT."""
+    longer: bool = False
+    """Compare with long-ct instead, which learns for about as many updates as F-CT does."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
     runs: Path | None = None
@@ -74,7 +76,7 @@ def main(options: Options) -> None:
     prepare_jax()
     for seed in options.seeds:
         for maze in options.maze:
-            variants = (untuned(options.tuned), options.tuned)
+            variants = (LONGER if options.longer else untuned(options.tuned), options.tuned)
             before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before["controller"] != after["controller"]:
                 raise UserError(f"the models of seed {seed} were led by different controllers")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _variants import TUNED, untuned
+from _variants import LONGER, TUNED, untuned
 
 from ct_jax.evaluate import GUIDED, wilson_of
 
@@ -324,19 +324,24 @@ def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def finetuned_table(results: dict[str, Any]) -> list[str]:
-    """One line for each robot, F-CT and maze: CT, F-CT and what lies between them, of the models of all seeds."""
-    lines = ["| robot | F-CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 8 + "|"]
+    """One line for each robot, F-CT, CT and maze: CT, F-CT and what lies between them, of the models of all seeds.
+
+    The CT is the one before it and, where there is one of the same data, that which has learned for as long.
+    """
+    lines = ["| robot | F-CT | CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 9 + "|"]
     rows = results["rows"]
     subject = lambda row: (row["robot"], row["variant"], row["maze"], row["episodes"])  # noqa: E731
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in sorted(rows, key=lambda row: row["model_seed"]):
         found.setdefault(subject(row), []).append(row)
     for robot, tuned, maze, pairs in dict.fromkeys(subject(row) for row in rows if row["variant"] in TUNED):
-        models = of_one_model(found.get((robot, untuned(tuned), maze, pairs), []), found[robot, tuned, maze, pairs])
-        if models:
-            rates = [pooled(list(those), "success") for those in zip(*models, strict=True)]
-            cells = [robot, f"`{tuned}`", maze, str(len(models)), str(pairs), *rates, gain_of(models)]
-            lines.append("| " + " | ".join(cells) + " |")
+        for ct in dict.fromkeys((untuned(tuned), LONGER)):
+            models = of_one_model(found.get((robot, ct, maze, pairs), []), found[robot, tuned, maze, pairs])
+            if models:
+                rates = [pooled(list(those), "success") for those in zip(*models, strict=True)]
+                counts = [str(len(models)), str(pairs)]
+                cells = [robot, f"`{tuned}`", f"`{ct}`", maze, *counts, *rates, gain_of(models)]
+                lines.append("| " + " | ".join(cells) + " |")
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
     on = f"pairs of seed {rows[0]['seed']}"
     return [*lines, *folded(f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}.")]

@@ -352,12 +352,18 @@ def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart()
     one = [row("cpu", 0, "1111"), row("cpu-ct", 0, "0000")]
     many = [row("mazes-ct", 1, "0011"), row("mazes-ct", 0, "1100"), row("mazes", 0, "1110"), row("mazes", 1, "0110")]
     lines = [line.split(" | ") for line in finetuned_table({"rows": [*many, *one]})[2:4]]
-    assert [line[1:5] for line in lines] == [["`mazes`", "m", "2", "4"], ["`cpu`", "m", "1", "4"]]
+    assert [line[1:6] for line in lines] == [
+        ["`mazes`", "`mazes-ct`", "m", "2", "4"],
+        ["`cpu`", "`cpu-ct`", "m", "1", "4"],
+    ]
     assert [line[-1].split()[0] for line in lines] == ["+12.5", "+100.0"]
     assert finetuned_table({"rows": [*one, *many]})[3] == finetuned_table({"rows": [*many, *one]})[2]  # in any order
     roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # of whose CT, cpu-ct, there is no seed 1
     (line,) = (line for line in finetuned_table({"rows": [*one, *roaming]}) if "roam" in line)
-    assert line.split(" | ")[3] == "1" and "+75.0" in line
+    assert line.split(" | ")[4] == "1" and "+75.0" in line
+    longer = finetuned_table({"rows": [*one, *roaming, row("long-ct", 1, "0111")]})
+    (line,) = (line for line in longer if "`roam` | `long-ct`" in line)
+    assert line.split(" | ")[4] == "1" and "+25.0" in line
 
 
 def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
