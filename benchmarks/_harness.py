@@ -158,9 +158,8 @@ class Results:
             on_cpu = jax.default_backend() == "cpu"
             file = RESULTS / f"{self.file.stem}{'' if on_cpu else '-gpu'}.json"
             file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-            if not on_cpu:
-                return
-            self.file.write_text(with_table(self.file.read_text("utf-8"), table_of(rows)), "utf-8")
+            if on_cpu:
+                self.file.write_text(with_table(self.file.read_text("utf-8"), table_of(rows)), "utf-8")
 
 
 def _installed(name: str) -> bool:

@@ -116,8 +116,9 @@ def find(folder: Path, benchmark: str, name: str, unit: str) -> dict[str, Any]:
 def measured(options: ScaleOptions, samples: int) -> Measured:
     """All rows that are needed. Raises UserError."""
     row, robot = options.results, options.robot
-    on_gpu = (row / "transformer-gpu.json").is_file()
-    trained, update = ("transformer-gpu", f"{robot}, bfloat16") if on_gpu else ("transformer", f"{robot}, float32")
+    trained, update = "transformer", f"{robot}, float32"
+    if (row / "transformer-gpu.json").is_file():
+        trained, update = "transformer-gpu", f"{robot}, bfloat16"
     return Measured(
         find(
             row, "rollout", f"{robot}, collection guided by {get_preset('cpu', robot).collect.guide}", "trajectories/s"
