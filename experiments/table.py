@@ -51,7 +51,7 @@ def summary_table(results: dict[str, dict[str, Any]]) -> list[str]:
         "F-CT, lifted",
         "planner with the map",
     ]
-    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    body = []
     for robot, mazes in _PAPER.items():
         ct, tuned = _LIFTED.get(robot, _BOTH)
         for maze, paper in mazes.items():
@@ -64,10 +64,16 @@ def summary_table(results: dict[str, dict[str, Any]]) -> list[str]:
             cells = [_together(models) for models in (*of, _models(rows, ct), _models(rows, tuned))]
             planners = sorted((r for r in rows if r["method"] == "planner"), key=lambda r: r["variant"] != ct)
             where = f"{maze} ({'seen' if rows and rows[0]['seen'] else 'unseen'})"
-            lines.append("| " + " | ".join([robot, where, f"{paper:g}", *cells, _together(planners[:1])]) + " |")
+            body.append([robot, where, f"{paper:g}", *cells, _together(planners[:1])])
     others = ", ".join(f"of the {robot} `{ct}` and `{tuned}`" for robot, (ct, tuned) in _LIFTED.items())
     note = f"Success in % with its 95 % interval, of n trained models. Lifted are `{'` and `'.join(_BOTH)}`, {others}."
-    return [*lines, "", note]
+    return [*grid(names, body), "", note]
+
+
+def grid(names: list[str], body: list[list[str]]) -> list[str]:
+    """A table in Markdown, from the names of its columns and the cells of its lines."""
+    head, *lines = (f"| {' | '.join(cells)} |" for cells in (names, *body))
+    return [head, "|---" * len(names) + "|", *lines]
 
 
 def _models(rows: list[dict[str, Any]], variant: str) -> list[dict[str, Any]]:
@@ -87,7 +93,7 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
     falls = any(row.get("fall_rate") for row in rows)
     names = ["maze", "method", "success %", "each model", "SPL", "return / 100", "collided %"] + ["fell %"] * falls
-    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    body = []
     together: dict[tuple[bool, str, str], list[dict[str, Any]]] = {}
     for row in sorted(rows, key=lambda row: (not row["seen"], row["maze"], _place(row))):
         together.setdefault((row["seen"], row["maze"], method_name(row)), []).append(row)
@@ -96,13 +102,13 @@ def experiment_table(results: dict[str, Any]) -> list[str]:
         cells += [f"{np.mean([row['spl'] for row in models]):.2f}"]
         cells += [f"{np.mean([row['return_scaled'] for row in models]):.1f}", pooled(models, "collision")]
         cells += [pooled(models, "fall")] if falls else []
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += differences(together) + reasons(results.get("unmade", []))
+        body.append(cells)
     pairs = {(row["episodes"], row["seed"]) for row in rows}
     on = "; ".join(f"{n} pairs of seed {seed}" for n, seed in sorted(pairs))
     seeds = ", ".join(str(seed) for seed in sorted({row["model_seed"] for row in rows}))
     note = f"{commands(rows)}; {on} in each maze; models of seeds {seeds}; {_INTERVALS}; {origin(rows)}"
-    return [*lines, *folded(f"{note}; {took(rows)}.")]
+    besides = differences(together) + reasons(results.get("unmade", []))
+    return [*grid(names, body), *besides, *folded(f"{note}; {took(rows)}.")]
 
 
 def folded(note: str) -> list[str]:
@@ -166,13 +172,13 @@ def _place(row: dict[str, Any]) -> int:
 
 def differences(together: dict[tuple[bool, str, str], list[dict[str, Any]]]) -> list[str]:
     """F-CT less CT in each maze, as published and lifted, pair by pair and model by model."""
-    lines = []
+    body = []
     for (seen, maze, name), tuned in together.items():
         before = FINE_TUNED.get(name, "")
         models = of_one_model(together.get((seen, maze, before), []), tuned)
         if models:
-            lines += [f"| {maze} | {name} less {before} | {gain_of(models)} | {len(models)} |"]
-    return ["", "| maze | success, pair by pair | of 100 | models |", "|---|---|---|---|", *lines] if lines else []
+            body.append([maze, f"{name} less {before}", gain_of(models), str(len(models))])
+    return ["", *grid(["maze", "success, pair by pair", "of 100", "models"], body)] if body else []
 
 
 def of_one_model(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> list[tuple[dict[str, Any], ...]]:
@@ -209,7 +215,7 @@ def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
 def room_table(results: dict[str, Any]) -> list[str]:
     """One line for each variant and reference, its models together; then densities, levels of noise, seven pairs."""
     names = ["model", "density", "noise", "success %", "each model", "SPL", "frontal %", "grazing %"]
-    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    body = []
     together: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
     sweeps = [*results.get("density", []), *results.get("noise", [])]
     for row in results["rows"] + sweeps:
@@ -219,17 +225,18 @@ def room_table(results: dict[str, Any]) -> list[str]:
         name = name if len(rows) == 1 else f"{name}, {len(rows)} models"
         success, *touched = (pooled(rows, rate) for rate in ("success", "frontal", "grazing"))
         cells = [name, f"{density:g}", f"{noise:g}", success, each_model(rows), f"{spl:.2f}", *touched]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", "| model | noise | seven pairs: full | partial | failed |", "|---|---|---|---|---|"]
+        body.append(cells)
+    seven = []
     for row in results.get("seven", []):
         name = f"{row['variant']}, seed {row['model_seed']}" if row["method"] == "ct" else row["method"]
         counts = [str(row[grade]) for grade in ("full", "partial", "failed")]
-        lines.append("| " + " | ".join([name, f"{row['noise']:g}", *counts]) + " |")
+        seven.append([name, f"{row['noise']:g}", *counts])
     rows = results["rows"]
     on = f"{rows[0]['worlds']} random rooms, {rows[0]['pairs']} pairs in each, of seed {rows[0]['seed']}"
     on += f" ({sweeps[0]['pairs']} where density or noise is another)" if sweeps else ""
     note = f"{commands(rows + sweeps)}; {on}; {_INTERVALS}; {origin(rows + sweeps)}; {took(rows)}."
-    return [*lines, *folded(note)]
+    graded = grid(["model", "noise", "seven pairs: full", "partial", "failed"], seven)
+    return [*grid(names, body), "", *graded, *folded(note)]
 
 
 def line_of(row: dict[str, Any]) -> str:
@@ -246,7 +253,7 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
     rows = results["rows"]
     marks = sorted({row["updates"] for row in rows})
     names = ["robot", "run", "start", "seeds", *(f"{mark}" for mark in marks), "90 % of the final at"]
-    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    body = []
     curves: dict[tuple[str, str, str], dict[int, list[float]]] = {}
     for row in sorted(rows, key=lambda row: row["updates"]):
         curve = curves.setdefault((row["robot"], row["run"], start_of(row)), {})
@@ -257,9 +264,9 @@ def transfer_table(results: dict[str, Any]) -> list[str]:
         reached = _reached(list(means), list(means.values()), 0.9 * max(finals))
         shown = [f"{100 * means[mark]:.0f}" if mark in means else "" for mark in marks]
         cells = [robot, f"`{run}`", start, str(len(curve[max(curve)])), *shown, reached]
-        lines.append("| " + " | ".join(cells) + " |")
+        body.append(cells)
     on = f"success in % after so many updates, {rows[0]['episodes']} pairs in the unseen maze, mean of the seeds"
-    return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+    return [*grid(names, body), "", f"{commands(rows)}; {on}; {origin(rows)}."]
 
 
 def start_of(row: dict[str, Any]) -> str:
@@ -311,16 +318,16 @@ def rate_of(rows: list[dict[str, Any]], name: str) -> tuple[float, float, float]
 
 def benchmark_table(rows: list[dict[str, Any]]) -> list[str]:
     """One line a figure of which something is asked, if there are such; all are in the benchmark's docstring."""
-    lines = ["| what | median (min-max) | against | times (min-max) | asked |", "|---|---|---|---|---|"]
+    body = []
     for row in [row for row in rows if row.get("asked")] or rows:
         ratio = row["ratio"]
         shown = f"{ratio['median']:.2f} ({ratio['min']:.2f}-{ratio['max']:.2f})" if ratio else ""
         figures = f"{row['value']:,.4g} ({row['min']:,.4g}-{row['max']:,.4g}) {row['unit']}"
         asked = f"{row['asked']:.3g}" if row.get("asked") else ""
-        lines.append(f"| {row['name']} | {figures} | {row['against']} | {shown} | {asked} |")
+        body.append([row["name"], figures, row["against"], shown, asked])
     made = rows[0]["made"]
     name = f"`{made['command']}`; commit {made['commit']}; {made['hardware']}; {made['created'][:10]}."
-    return [*lines, "", name]
+    return [*grid(["what", "median (min-max)", "against", "times (min-max)", "asked"], body), "", name]
 
 
 def finetuned_table(results: dict[str, Any]) -> list[str]:
@@ -328,7 +335,8 @@ def finetuned_table(results: dict[str, Any]) -> list[str]:
 
     The CT is the one before it and, where there is one of the same data, that which has learned for as long.
     """
-    lines = ["| robot | F-CT | CT | maze | models | pairs | CT % | F-CT % | F-CT less CT, of 100 |", "|---" * 9 + "|"]
+    names = ["robot", "F-CT", "CT", "maze", "models", "pairs", "CT %", "F-CT %", "F-CT less CT, of 100"]
+    body = []
     rows = results["rows"]
     subject = lambda row: (row["robot"], row["variant"], row["maze"], row["episodes"])  # noqa: E731
     found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -340,24 +348,24 @@ def finetuned_table(results: dict[str, Any]) -> list[str]:
             if models:
                 rates = [pooled(list(those), "success") for those in zip(*models, strict=True)]
                 counts = [str(len(models)), str(pairs)]
-                cells = [robot, f"`{tuned}`", f"`{ct}`", maze, *counts, *rates, gain_of(models)]
-                lines.append("| " + " | ".join(cells) + " |")
+                body.append([robot, f"`{tuned}`", f"`{ct}`", maze, *counts, *rates, gain_of(models)])
     trained = ", ".join(sorted({f"{row['trained']['hardware']}, commit {row['trained']['commit']}" for row in rows}))
     on = f"pairs of seed {rows[0]['seed']}"
-    return [*lines, *folded(f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}.")]
+    note = f"{commands(rows)}; {on}; {_INTERVALS}; {origin(rows)}; models made on {trained}."
+    return [*grid(names, body), *folded(note)]
 
 
 def cql_table(results: dict[str, Any]) -> list[str]:
     """One line for each settings of PT-CQL that were tried."""
     names = ["robot", "alpha", "target rate", "reward scale", "imitation", "updates", "success %"]
-    lines = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    body = []
     rows = results["rows"]
     tried = ("alpha", "target_rate", "reward_scale", "imitation", "updates")
     for row in rows:
         cells = [row["robot"], *(f"{row[name]:g}" for name in tried), pooled([row], "success")]
-        lines.append("| " + " | ".join(cells) + " |")
+        body.append(cells)
     on = f"{rows[0]['episodes']} pairs of seed {rows[0]['seed']} in {rows[0]['maze']}"
-    return [*lines, "", f"{commands(rows)}; {on}; {origin(rows)}."]
+    return [*grid(names, body), "", f"{commands(rows)}; {on}; {origin(rows)}."]
 
 
 TABLES = {"finetuned": finetuned_table, "cql": cql_table, "transfer": transfer_table}  # by the file's name
