@@ -102,11 +102,16 @@ class Plan(NamedTuple):
     traffic: float  # of an update
 
 
+def look(file: Path, name: str, unit: str) -> dict[str, Any] | None:
+    """A row of a file, if both are there."""
+    rows = json.loads(file.read_text("utf-8")) if file.is_file() else []
+    return next((row for row in rows if (row["name"], row["unit"]) == (name, unit)), None)
+
+
 def find(folder: Path, benchmark: str, name: str, unit: str) -> dict[str, Any]:
     """A row. Raises UserError naming the benchmark to run where there is none."""
     file = folder / f"{benchmark}.json"
-    rows = json.loads(file.read_text("utf-8")) if file.is_file() else []
-    found = next((row for row in rows if (row["name"], row["unit"]) == (name, unit)), None)
+    found = look(file, name, unit)
     if found is None:
         script = f"benchmarks/{benchmark.removesuffix('-gpu')}.py"
         raise UserError(f"{file.name} has no row '{name}' in {unit}; run: python {script}")
@@ -116,9 +121,9 @@ def find(folder: Path, benchmark: str, name: str, unit: str) -> dict[str, Any]:
 def measured(options: ScaleOptions, samples: int) -> Measured:
     """All rows that are needed. Raises UserError."""
     row, robot = options.results, options.robot
-    trained, update = "transformer", f"{robot}, float32"
-    if (row / "transformer-gpu.json").is_file():
-        trained, update = "transformer-gpu", f"{robot}, bfloat16"
+    trained, update = "transformer-gpu", f"{robot}, bfloat16"
+    if look(row / f"{trained}.json", update, "steps/s") is None:
+        trained, update = "transformer", f"{robot}, float32"
     return Measured(
         find(
             row, "rollout", f"{robot}, collection guided by {get_preset('cpu', robot).collect.guide}", "trajectories/s"

@@ -201,15 +201,20 @@ def test_the_page_is_computed_from_what_was_measured(tmp_path):
     assert page.count("| memory of a GPU |") == 3 and "## What breaks first" in page and "nan" not in page
 
 
-def test_an_update_that_a_gpu_was_measured_at_is_taken_from_there(tmp_path):
+@pytest.mark.parametrize("robot", ["point", "ant"])
+def test_an_update_that_a_gpu_was_measured_at_is_taken_from_there(tmp_path, robot):
+    """Not another robot's, though: then a CPU's is taken."""
     options = scale_options(tmp_path, **MEASURED)
     made = {"hardware": "1 x NVIDIA, x86_64 CPU, 16 cores", "commit": "0"}
     rows = [
-        {"name": "point, bfloat16", "unit": unit, "value": value, "made": made}
+        {"name": f"{robot}, bfloat16", "unit": unit, "value": value, "made": made}
         for unit, value in (("steps/s", 200.0), ("GFLOP/s", 9.0))
     ]
     (tmp_path / "transformer-gpu.json").write_text(json.dumps(rows))
-    assert scale.update_s(scale.measured(options, 200), scale.Assumed()) == 1 / 200.0
+    found = scale.measured(options, 200)
+    assert scale.on_gpu(found) == (robot == "point")
+    if robot == "point":
+        assert scale.update_s(found, scale.Assumed()) == 1 / 200.0
 
 
 def test_more_hosts_hold_less_and_say_more(tmp_path):
