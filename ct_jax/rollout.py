@@ -62,7 +62,7 @@ def rollout(
         mesh: the devices that share the environments evenly. Which device steps one changes nothing of what happens.
     """
     step = jax.vmap(env.step)
-    if mesh is not None:  # each device steps its own: XLA would not split the calls of MuJoCo by itself
+    if mesh is not None and mesh.size > 1:  # each steps its own: XLA would not split the calls of MuJoCo by itself
         spec = sharded(mesh).spec
         step = jax.shard_map(step, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 

@@ -106,7 +106,7 @@ def test_the_model_is_read_back_as_it_was_made(tiny_run, tiny_settings):
 
 def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(tiny_settings, tmp_path):
     collecting = dataclasses.replace(tiny_settings.collect, trajectories=6, reset_interval=2)
-    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, random_mazes=3, collect=collecting))
+    run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, random_mazes=3, collect=collecting, rounds=0))
     pipeline.train(run)
     data = storage.load(run.folder / "collect" / "trajectories.npz")
     assert set(data.maze.tolist()) > {0} and data.maze.max() <= 3
