@@ -120,7 +120,7 @@ def reasons(unmade: list[dict[str, Any]]) -> list[str]:
     """Why methods have no row."""
     told = [
         f"{method_name(row)}, seed {row['model_seed']}: {row['why']} ({commands([row])}; {origin([row])})"
-        for row in unmade
+        for row in sorted(unmade, key=lambda row: (row["variant"], row["model_seed"]))
     ]
     return ["", f"Without a row: {'; '.join(told)}."] if told else []
 
