@@ -23,6 +23,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+import ct_envs.quiet  # noqa: F401
 from ct_jax.compilation import keep_programs
 from ct_jax.run import provenance
 

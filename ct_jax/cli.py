@@ -269,12 +269,13 @@ def _reason(text: str) -> str:
 
 def prepare_jax(among: Processes = Processes()) -> None:
     """One CPU device a core, exact float32 products, compiled programs that are kept, and the other processes."""
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX says that warp, which we do not use, is missing
-        import jax
+    import jax
 
-        import ct_jax.pipeline  # noqa: F401
-        from ct_jax.compilation import keep_programs
-        from ct_jax.run import cores
+    import ct_envs.quiet  # noqa: F401
+    import ct_jax.pipeline  # noqa: F401
+    from ct_jax.compilation import keep_programs
+    from ct_jax.run import cores
+
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs what it also raises, in hundreds of lines
     # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+import ct_envs.quiet  # noqa: F401
 from ct_envs import UserError
 from ct_jax import pipeline
 from ct_jax import trajectories as storage

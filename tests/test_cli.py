@@ -67,6 +67,12 @@ def test_json_is_the_only_thing_on_stdout(tiny_run, islands):
     assert 0 <= row["success_ci95"][0] <= row["success_rate"] <= row["success_ci95"][1] <= 1
 
 
+def test_imports_say_nothing():
+    """Not of the libraries that are looked for, either; nor does an experiment, before its help."""
+    assert shell("-c", "from ct_envs import MazeEnv").stdout == ""
+    assert shell("experiments/point.py", "--help", cwd=ROOT).stdout.lstrip().startswith("usage:")
+
+
 @pytest.mark.parametrize("method", ["ct", "planner", "explorer"])
 def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
     """The same seed means the same pairs, in the run and afterwards."""

@@ -29,6 +29,8 @@ _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 def __getattr__(name: str) -> Any:
     if name not in _MODULE:
         raise AttributeError(f"module 'ct_envs' has no attribute '{name}'")
+    if _MODULE[name] == "maze_env":  # which imports MJX
+        import_module("ct_envs.quiet")
     return getattr(import_module(f"ct_envs.{_MODULE[name]}"), name)
 
 
