@@ -10,7 +10,6 @@ import io
 import json
 import multiprocessing
 import os
-import time
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -50,21 +49,24 @@ def pytest_runtest_protocol(item):
     `@pytest.mark.rank_promotion("allow")`, or a whole file with `pytestmark = ...` of the same mark.
     Flax, optax and Orbax work under "raise".
     """
-    marker, begun = item.get_closest_marker("rank_promotion"), time.monotonic()
+    marker = item.get_closest_marker("rank_promotion")
     before = jax.config.jax_numpy_rank_promotion
     jax.config.update("jax_numpy_rank_promotion", marker.args[0] if marker else "raise")
     try:
         return (yield)
     finally:
         jax.config.update("jax_numpy_rank_promotion", before)
-        # Who compiled little was quick; to count takes some milliseconds.
-        if time.monotonic() - begun > 2.0 and _memory_maps() > _MANY_MAPS:
-            jax.clear_caches()
 
 
 # Each compiled program takes some of the 65530 memory maps that Linux grants a process; without one, XLA crashes. A
 # test without compilation has thousands of programs, one for each operation and shape: no process can keep them all.
 _MANY_MAPS = 20_000
+
+
+def pytest_runtest_logreport(report):
+    """Forgets compiled programs where memory maps would run out. To count takes milliseconds: not after quick tests."""
+    if report.duration > 2.0 and _memory_maps() > _MANY_MAPS:
+        jax.clear_caches()
 
 
 def _memory_maps() -> int:
