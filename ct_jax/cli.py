@@ -122,6 +122,9 @@ class Evaluate:
     """Turtlebot3: how full the rooms are, 1 as in training."""
     noise: Annotated[float | None, arg(metavar="F", help_behavior_hint="(default: 0)")] = None
     """Turtlebot3: errors of sensors and motion, 1 as on a real robot."""
+    horizon: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: by the longest way)")] = None
+    """Control steps of an episode. By default the robot's own (1000 for the ant), more in proportion where the longest
+    way is longer than in the paper's mazes."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the pairs; the same pairs for every method."""
     method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
@@ -380,7 +383,19 @@ def _evaluate(command: Evaluate) -> None:
         from ct_jax import pipeline
         from ct_jax.devices import is_first
 
-        names = ("maze", "episodes", "engine", "worlds", "pairs", "density", "noise", "optimism", "picture", "video")
+        names = (
+            "maze",
+            "episodes",
+            "horizon",
+            "engine",
+            "worlds",
+            "pairs",
+            "density",
+            "noise",
+            "optimism",
+            "picture",
+            "video",
+        )
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
         row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
     if not is_first():
@@ -461,7 +476,24 @@ def print_rows(rows: list[Row]) -> None:
         table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(show(row) for show in columns.values()))
-    _console(width=None if sys.stdout.isatty() else 120).print(table)
+    console = _console(width=None if sys.stdout.isatty() else 120)
+    console.print(table)
+    for row in rows:
+        for note in _notes(row):
+            console.print(f"{row['maze']}, {row['method']}: {note}", style="dim", soft_wrap=True)
+
+
+def _notes(row: Row) -> Iterator[str]:
+    """What a reader of a row must know besides its figures."""
+    if beyond := row.get("beyond_horizon"):
+        yield (
+            f"{beyond} of {row['episodes']} pairs are farther apart than the robot goes in an episode of "
+            f"{row['horizon']} steps, and count as failures; give it more with --horizon"
+        )
+    if apart := row.get("not_joined"):
+        yield f"the roadmap joins no way for {apart} of {row['episodes']} pairs, although it has all its samples"
+    if straight := row.get("straight_ways"):
+        yield f"of {straight} of {row['episodes']} pairs no shortest way is known; SPL takes the straight line"
 
 
 if __name__ == "__main__":

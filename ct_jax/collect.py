@@ -1,5 +1,6 @@
 """Collecting planner-guided trajectories (paper, Algorithm 3)."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,10 +11,10 @@ from brax.envs.base import State
 
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.maze import Maze, sample_pair
-from ct_jax.devices import data_mesh, fill_up, joined, own, own_rows, place, sharded
+from ct_jax.devices import data_mesh, fill_up, joined, largest, own, own_rows, place, sharded
 from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
-from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap
+from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, draw_joined, extend, stack_tables
 from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
 
@@ -222,7 +223,10 @@ def draw_batch(
         _endpoints(keys[i], jax.tree.map(lambda leaf, m=maze_of_map[i]: leaf[m], mazes), env, config, prm, per_map)
         for i in (mine if len(mine) else [0])  # without a share, one for its shapes
     ]
-    tables, start, goal = jax.tree.map(lambda *leaves: joined(np.stack(leaves)[: len(mine)]), *drawn)
+    tables, start, goal = zip(*drawn, strict=True)
+    start, goal = (joined(np.stack(ends)[: len(mine)]) for ends in (start, goal))
+    tables = stack_tables(list(tables), largest)
+    tables = jax.tree.map(lambda leaf: joined(np.asarray(leaf)[: len(mine)]), tables)
     order = fill_up(config.envs, data_mesh())
     start, goal = (jnp.asarray(ends.reshape(-1, 2)[order]) for ends in (start, goal))
     which = np.repeat(np.arange(n_maps), per_map)[order]
@@ -249,10 +253,17 @@ def _endpoints(
 ) -> tuple[PlanTable, jax.Array, jax.Array]:
     """A fresh roadmap, and n starts and goals [n, 2] (m) that it connects."""
     map_key, pair_key = jax.random.split(key)
-    roadmap = build_roadmap(map_key, maze, radius_m=env.robot.radius_m, config=prm)
+    build = functools.partial(build_roadmap, map_key, maze, radius_m=env.robot.radius_m, config=prm)
     if config.starts == "maze":
         pairs = jax.vmap(lambda k: sample_pair(k, maze, radius=env.robot.radius_m))(jax.random.split(pair_key, n))
-        return roadmap.table, *pairs
-    reachable = np.argwhere(np.isfinite(np.asarray(roadmap.table.distance)) & ~np.eye(prm.samples, dtype=bool))
-    chosen = reachable[np.asarray(jax.random.randint(pair_key, (n,), 0, len(reachable)))]
-    return roadmap.table, roadmap.table.points[chosen[:, 0]], roadmap.table.points[chosen[:, 1]]
+        ends = np.stack(pairs, 1)
+        if config.guide == "explorer":  # which asks no roadmap: any table does
+            return build(ends=ends[:0]).table, *pairs
+        roadmap = build(ends=ends)
+        goals = np.arange(n) + len(roadmap.points)
+        grown = extend(roadmap, ends[:, 1]) if roadmap.samples > prm.samples else roadmap
+        return grown.table_to(goals), *pairs
+    roadmap = build()
+    chosen = draw_joined(pair_key, roadmap, n)
+    points = jnp.asarray(roadmap.points)
+    return roadmap.table_to(chosen[:, 1]), points[chosen[:, 0]], points[chosen[:, 1]]

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import jax
@@ -11,16 +11,19 @@ import numpy as np
 from brax.envs.base import State
 from scipy import stats
 
-from ct_envs import MazeEnv
+from ct_envs import MazeEnv, UserError
 from ct_envs.maze import Maze, sample_pair
+from ct_envs.robots import Robot
 from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
 from ct_jax.devices import data_mesh, fill_up, joined, own
 from ct_jax.policy import Conditioned
-from ct_jax.prm import PlanTable, PrmConfig, build_roadmap, extend
+from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend
 from ct_jax.rollout import Controller, Guided, Policy, Steps
 
 METHODS = ("ct", "planner", "explorer")
 GUIDED = ("planner", "explorer")  # what is led by a plan; everything else is a policy that was learned
+MAX_HORIZON = 1_000_000
+_DENSE = PrmConfig(samples=1000)  # of the shortest ways
 RETURN_UNIT = 100.0  # the paper's scaled return is the raw one over this
 
 
@@ -30,9 +33,10 @@ class Pairs:
 
     start: np.ndarray  # [n, 2], [m]
     goal: np.ndarray
-    shortest_m: np.ndarray  # [n], on a dense roadmap
+    shortest_m: np.ndarray  # [n], on a dense roadmap; where it has no path, the straight line
     seed: int
     world: np.ndarray | None = None  # int [n]: which of several worlds each is in
+    straight: int = 0  # how many have only a straight line for a shortest way: it is a lower bound
 
 
 @dataclass(frozen=True)
@@ -49,10 +53,13 @@ class Episodes:
     path: np.ndarray  # float32 [T, n, 2]: positions, for pictures
     pairs: Pairs
     wall_s: float
+    horizon: int  # control steps of an episode
     asked: np.ndarray | None = None  # return asked for at the start
     film: np.ndarray | None = None  # float32 [T, nq]: ``qpos`` before each step, of the first episode, for a video
     frontal: np.ndarray | None = None  # bool [n]: ran into something, where that is told from ...
     grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
+    not_joined: int | None = None  # of a planner: pairs that its roadmap does not join
+    beyond: int = 0  # pairs too far apart for the robot to make within the horizon
 
     def summary(self) -> dict[str, Any]:
         """Rates and means; intervals are 95 %: Wilson for rates, bootstrap over episodes for means."""
@@ -67,6 +74,8 @@ class Episodes:
         rows |= {"timeout_rate": float(self.timeout.mean()), "timeout_ci95": wilson(self.timeout)}
         for name, told in (("frontal", self.frontal), ("grazing", self.grazing)):
             rows |= {} if told is None else {f"{name}_rate": float(told.mean()), f"{name}_ci95": wilson(told)}
+        rows |= {"horizon": self.horizon, "beyond_horizon": self.beyond, "straight_ways": self.pairs.straight}
+        rows |= {} if self.not_joined is None else {"not_joined": self.not_joined}
         return rows | {"steps_mean": float(self.steps.mean()), "wall_s": round(self.wall_s, 2)}
 
 
@@ -96,18 +105,20 @@ def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: f
     start, goal = map(np.asarray, draw(keys))
     apart = np.flatnonzero(np.linalg.norm(start - goal, axis=1) > 2 * tolerance_m)[:n]
     start, goal = start[apart], goal[apart]
-    dense = PrmConfig(samples=1000)
-    table = extend(build_roadmap(jax.random.key(seed), maze, radius_m=radius_m, config=dense), _join(start, goal)).table
-    row = np.arange(len(start))
-    shortest = np.asarray(table.distance)[dense.samples + 2 * row, dense.samples + 2 * row + 1]
-    straight = np.linalg.norm(start - goal, axis=1)
-    # In a very large maze the samples may not join a pair; a lower bound keeps its SPL a number, and strict.
-    shortest = np.where(np.isfinite(shortest), shortest, straight)
-    return Pairs(start, goal, shortest, seed)
+    shortest, straight = shortest_ways(jax.random.key(seed), maze, start, goal, radius_m=radius_m, config=_DENSE)
+    return Pairs(start, goal, shortest, seed, straight=straight)
 
 
-def _join(start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    return np.stack([start, goal], 1).reshape(-1, 2)
+def shortest_ways(
+    key: jax.Array, space: Maze | Space, start: np.ndarray, goal: np.ndarray, *, radius_m: float, config: PrmConfig
+) -> tuple[np.ndarray, int]:
+    """Lengths [n] (m) of the shortest ways between starts and goals [n, 2] (m) on a roadmap, which grows until it joins
+    them. Where it cannot, the straight line: a lower bound, for a strict SPL. And how many these are."""
+    roadmap = build_roadmap(key, space, radius_m=radius_m, config=config, ends=np.stack([start, goal], 1))
+    grown = extend(roadmap, np.stack([start, goal], 1).reshape(-1, 2))
+    shortest = grown.distances(len(roadmap.points) + np.arange(2 * len(start)).reshape(-1, 2))
+    unknown = ~np.isfinite(shortest)
+    return np.where(unknown, np.linalg.norm(start - goal, axis=1), shortest), int(unknown.sum())
 
 
 class Learned(Policy, Protocol):
@@ -116,6 +127,22 @@ class Learned(Policy, Protocol):
     def init(self, state: State) -> Any:
         """Its memory at the start of N episodes."""
         ...
+
+
+def check_horizon(horizon: int | None) -> None:
+    """Raises UserError for a horizon that is given and out of its range."""
+    if horizon is not None and not 1 <= horizon <= MAX_HORIZON:
+        raise UserError(f"--horizon {horizon}: give a number of control steps from 1 to {MAX_HORIZON}")
+
+
+def horizon_for(robot: Robot, pairs: Pairs) -> int:
+    """Control steps of an episode: the robot's own horizon, or more in proportion to the longest way of the pairs."""
+    return int(np.ceil(robot.horizon * max(1.0, float(pairs.shortest_m.max()) / robot.way_m)))
+
+
+def beyond_horizon(robot: Robot, pairs: Pairs, horizon: int) -> int:
+    """How many pairs are farther apart than the robot goes in so many control steps."""
+    return int((pairs.shortest_m > robot.cruise_mps * robot.control_dt_s * horizon).sum())
 
 
 def evaluate(
@@ -127,6 +154,7 @@ def evaluate(
     policy: Learned | None = None,
     controller: Controller | None = None,
     prm: PrmConfig | None = None,
+    horizon: int | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
     """Run one method on all pairs at once, which all devices share.
@@ -134,14 +162,16 @@ def evaluate(
     Args:
         env: with maps, without auto-reset.
         method: "planner" (the full map, needs ``controller``), "explorer" (likewise), or any name for ``policy``.
+        horizon: control steps of an episode; by default the environment's.
     """
+    env = env.with_horizon(horizon or env.horizon)
     begun = time.perf_counter()
     order = fill_up(len(pairs.start), data_mesh())
     n = len(order)
     key = jax.random.key(pairs.seed)
     mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
     state = start_episodes(env, key, mazes, jnp.asarray(pairs.start[order]), jnp.asarray(pairs.goal[order]))
-    asked = None
+    asked = not_joined = None
     if method not in GUIDED:
         assert policy is not None
         actor, memory = policy, policy.init(state)
@@ -150,13 +180,23 @@ def evaluate(
         assert controller is not None
         prm = prm or PrmConfig()
         guide = make_guide("shortcut" if method == "planner" else method, env, prm)
-        roadmap = build_roadmap(key, maze, radius_m=env.robot.radius_m, config=prm)
-        table = extend(roadmap, _join(pairs.start, pairs.goal)).table
-        tables: PlanTable = jax.tree.map(lambda leaf: leaf[None], table)
+        tables, not_joined = _plans(key, env, maze, pairs, prm) if method == "planner" else (None, None)
         actor = Guided(controller, guide)
         memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
     state, _, steps = run_episodes(env, actor, state, memory, key, chunk=50, limit=env.horizon, on_progress=on_progress)
-    return _outcome(env, state, steps, pairs, time.perf_counter() - begun, asked)
+    episodes = _outcome(env, state, steps, pairs, time.perf_counter() - begun, asked)
+    return replace(episodes, not_joined=not_joined)
+
+
+def _plans(key: jax.Array, env: MazeEnv, maze: Maze, pairs: Pairs, prm: PrmConfig) -> tuple[PlanTable, int]:
+    """The planner's ways to the goals, with a leading axis of one, and how many starts and goals they do not join."""
+    ends = np.stack([pairs.start, pairs.goal], 1)
+    roadmap = build_roadmap(key, maze, radius_m=env.robot.radius_m, config=prm, ends=ends)
+    grown = extend(roadmap, ends.reshape(-1, 2))
+    nodes = len(roadmap.points) + np.arange(2 * len(ends)).reshape(-1, 2)
+    component = grown.components[nodes]
+    table = jax.tree.map(lambda leaf: leaf[None], grown.table_to(nodes[:, 1]))
+    return table, int((component[:, 0] != component[:, 1]).sum())
 
 
 def _outcome(
@@ -184,4 +224,7 @@ def _outcome(
     every_path = joined(np.swapaxes(path, 0, 1))[:n]
     rest = env.engine.model.nq - 2  # of qpos, with which proprioception begins
     film = joined(np.concatenate([path[:, 0], steps.proprio[:, 0, :rest]], -1)[None])[0]
-    return Episodes(**each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s, film=film)
+    return Episodes(
+        **each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s, horizon=env.horizon, film=film,
+        beyond=beyond_horizon(env.robot, pairs, env.horizon),
+    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -10,20 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 
+from ct_envs.robots import TURTLEBOT3
 from ct_envs.turtlebot3 import RADIUS_M
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
 from ct_envs.turtlebot3_world import World
 from ct_jax.collect_turtlebot3 import Room, Wave, clutter, drive_guided, make_guide
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, drive
-from ct_jax.evaluate import GUIDED, Episodes, Learned, Pairs
+from ct_jax.evaluate import GUIDED, Episodes, Learned, Pairs, beyond_horizon, shortest_ways
 from ct_jax.policy import Conditioned
-from ct_jax.prm import PrmConfig, build_roadmap, extend
+from ct_jax.prm import PrmConfig, build_roadmap, joins
 from ct_jax.rollout import Action, Policy
 
 _EVALUATION = 1  # seeds of these rooms have three entries, those of training two: none is in both
-_DENSE = PrmConfig(samples=600, connect_m=2.0)
-PLANNER = PrmConfig(samples=400, connect_m=2.0, margin_m=0.03)  # joins what a robot can reach, and cuts no corner
+_DENSE = PrmConfig(samples=600, connect_m=2.0, most_samples=2400)
+PLANNER = PrmConfig(
+    samples=400, connect_m=2.0, margin_m=0.03, most_samples=1600
+)  # joins what a robot can reach, and cuts no corner
 
 
 # ------------------------------------------------------------------------------------------------------ a policy
@@ -78,13 +81,13 @@ def draw_room_pairs(seed: int, worlds: Sequence[World], n: int) -> Pairs:
     for number, world in enumerate(worlds):
         rng = np.random.default_rng((_EVALUATION, seed, number, 1))
         ends = np.array([world.sample_pair(rng, RADIUS_M) for _ in range(n)])
-        roadmap = build_roadmap(jax.random.key(seed), world, radius_m=RADIUS_M, config=_DENSE)
-        table = extend(roadmap, ends.reshape(-1, 2)).table
-        row = _DENSE.samples + 2 * np.arange(n)
-        way, straight = np.asarray(table.distance)[row, row + 1], np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-        parts.append((ends, np.where(np.isfinite(way), way, straight)))
-    ends, shortest = (np.concatenate(leaves) for leaves in zip(*parts, strict=True))
-    return Pairs(ends[:, 0], ends[:, 1], shortest, seed, np.repeat(np.arange(len(worlds)), n))
+        way, straight = shortest_ways(
+            jax.random.key(seed), world, ends[:, 0], ends[:, 1], radius_m=RADIUS_M, config=_DENSE
+        )
+        parts.append((ends, way, np.array([straight])))
+    ends, shortest, straight = (np.concatenate(leaves) for leaves in zip(*parts, strict=True))
+    which = np.repeat(np.arange(len(worlds)), n)
+    return Pairs(ends[:, 0], ends[:, 1], shortest, seed, which, straight=int(straight.sum()))
 
 
 def evaluate_rooms(
@@ -106,7 +109,9 @@ def evaluate_rooms(
     begun = time.perf_counter()
     assert pairs.world is not None
     key = jax.random.key(pairs.seed)
-    rooms = [_room(key, world) for world in worlds] if method in GUIDED else []
+    ends = np.stack([pairs.start, pairs.goal], 1)
+    rooms = [_room(key, world, ends[pairs.world == i]) for i, world in enumerate(worlds) if method in GUIDED]
+    not_joined = [int((~joins(room.roadmap, ends[pairs.world == i])).sum()) for i, room in enumerate(rooms)]
     drives: list[Drive] = []
     asked: list[np.ndarray] = []
     for first in range(0, len(pairs.start), pool.n):
@@ -123,12 +128,17 @@ def evaluate_rooms(
             drives += drive(pool, episodes, driver, begin)
         if on_progress is not None:
             on_progress(first // pool.n + 1, len(drives))
-    return _outcome(drives, pairs, time.perf_counter() - begun, np.concatenate(asked) if asked else None)
+    horizon = pool.config.horizon
+    return replace(
+        _outcome(drives, pairs, time.perf_counter() - begun, np.concatenate(asked) if asked else None, horizon),
+        not_joined=sum(not_joined) if method == "planner" else None,
+        beyond=beyond_horizon(TURTLEBOT3, pairs, horizon),
+    )
 
 
-def _room(key: jax.Array, world: World) -> Room:
-    """A world with the roadmap of the reference planner."""
-    return Room(world, build_roadmap(key, world, radius_m=RADIUS_M, config=PLANNER))
+def _room(key: jax.Array, world: World, ends: np.ndarray) -> Room:
+    """A world with the roadmap of the reference planner, which joins these starts and goals [k, 2, 2] (m)."""
+    return Room(world, build_roadmap(key, world, radius_m=RADIUS_M, config=PLANNER, ends=ends))
 
 
 def grades(episodes: Episodes) -> dict[str, int]:
@@ -152,7 +162,7 @@ def _telling(driver: PolicyDriver, asked: list[np.ndarray], n: int) -> Callable[
     return begin
 
 
-def _outcome(drives: list[Drive], pairs: Pairs, wall_s: float, asked: np.ndarray | None) -> Episodes:
+def _outcome(drives: list[Drive], pairs: Pairs, wall_s: float, asked: np.ndarray | None, horizon: int) -> Episodes:
     longest = max(each.length for each in drives)
     paths = [np.pad(each.path, [(0, longest + 1 - len(each.path)), (0, 0)], mode="edge") for each in drives]
     success = np.array([each.success for each in drives])
@@ -168,6 +178,7 @@ def _outcome(drives: list[Drive], pairs: Pairs, wall_s: float, asked: np.ndarray
         path=np.stack(paths, 1)[1:].astype(np.float32),
         pairs=pairs,
         wall_s=wall_s,
+        horizon=horizon,
         asked=asked,
         frontal=frontal,
         grazing=grazing,

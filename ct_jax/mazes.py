@@ -15,7 +15,7 @@ from ct_jax import devices
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
-from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, draw_pairs, evaluate
+from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, check_horizon, draw_pairs, evaluate, horizon_for
 from ct_jax.finetune import recover
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
@@ -26,7 +26,7 @@ from ct_jax.trajectories import Trajectories
 
 MAX_EPISODES = 100_000
 PICTURES = (".png", ".svg", ".pdf")
-PAIR_ARRAYS = ("start", "goal", "shortest_m")
+PAIR_ARRAYS = ("start", "goal", "shortest_m")  # and how many of the last are straight lines
 Progress = Callable[[int, int], None]
 
 
@@ -131,11 +131,12 @@ def head(robot: str, method: str, maze: str, episodes: int, seed: int) -> dict[s
 
 def _watched(
     env: MazeEnv, maze: Maze, pairs: Pairs, method: str, name: str, policy: Learned,
-    controller: SacController | None, prm: PrmConfig,
+    controller: SacController | None, prm: PrmConfig, horizon: int | None = None,
 ) -> Episodes:  # fmt: skip
     with Bar(f"{method} in {name}", len(pairs.start)) as bar:
         return evaluate(
             env, maze, pairs, method, policy=policy, controller=controller, prm=prm,
+            horizon=horizon or horizon_for(env.robot, pairs),
             on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
         )  # fmt: skip
 
@@ -147,19 +148,21 @@ def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
     found = devices.first(lambda: read_json(file) if file.is_file() else None)
     if found is not None:
         start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
-        return Pairs(start, goal, shortest_m, seed)
+        return Pairs(start, goal, shortest_m, seed, straight=int(found.get("straight", 0)))
     pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    devices.first(lambda: write_json(file, {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS}))
+    arrays = {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS}
+    devices.first(lambda: write_json(file, arrays | {"straight": pairs.straight}))
     return pairs
 
 
 def evaluate_in_maze(
     model: TrainedModel, method: str, seed: int, *, maze: str = "antmaze-large", episodes: int = 100,
-    engine: str = "auto", picture: Path | None = None, video: Path | None = None,
+    engine: str = "auto", picture: Path | None = None, video: Path | None = None, horizon: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in one maze; returns its row of the table.
 
     Args:
+        horizon: control steps of an episode; by default in proportion to the longest way.
         picture: file for a picture of all episodes.
         video: file for a video of the first one.
 
@@ -170,6 +173,7 @@ def evaluate_in_maze(
         raise UserError(f"--picture {picture}: give a {', '.join(PICTURES)} file in a folder that exists")
     if not 1 <= episodes <= MAX_EPISODES:
         raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
+    check_horizon(horizon)
     world = load_maze(maze)
     if video is not None:
         from ct_jax.report.video import check_video, write_video  # with matplotlib, which takes its time
@@ -179,7 +183,7 @@ def evaluate_in_maze(
     robot = env.robot
     pairs = draw_pairs(seed, world, episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     name = Path(maze).stem
-    outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm)
+    outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm, horizon)
     row = head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
     if picture is not None and devices.is_first():
         from ct_jax.report import pictures  # likewise

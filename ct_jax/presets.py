@@ -191,7 +191,7 @@ def with_fits(settings: Settings, **changes: Any) -> Settings:
 
 
 TURTLEBOT3_PAPER = Settings(
-    prm=PrmConfig(samples=150, connect_m=2.0),
+    prm=PrmConfig(samples=150, connect_m=2.0, most_samples=2400),
     collect=CollectConfig(trajectories=1000, reset_interval=25, envs=50, horizon=400),
     model=ModelConfig(layers=4, heads=4, width=128, context=5, context_acting=5, map_cell_m=LIDAR_CELL_M),
     fit=FitConfig(updates=15_000, batch=128, steps=5, learning_rate=1e-4, weight_decay=1e-4, warmup=10_000),
@@ -270,6 +270,7 @@ def get_preset(name: str, robot: str = "point") -> Settings:
 
 # Settings that came later, with what was before them: left out where they say just that, so that a run of then goes on.
 _LATER = {
+    "most_samples": 25_600,
     "rooms": None,
     "random_mazes": 0,
     "controller_effort": 1.0,

@@ -17,13 +17,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from ct_envs.errors import UserError
-from ct_envs.maze import Maze, clearance, in_sight, segment_free, segment_reach, unpadded
+from ct_envs.maze import Maze, clearance, in_sight, label_regions, segment_free, segment_reach, unpadded
 
 _CANDIDATES = 64  # nearest points among which a new waypoint is sought
+_ALL_PAIRS = 2048  # a larger roadmap has a table of the ways to its goals only: all pairs would fill the memory
+_JOINED_SHARE = 0.5  # a roadmap suffices by itself if it joins so many of the pairs of its own points
+_NOWHERE_M = 1e7  # coordinate of points that only fill up a table: in sight of nothing
 NO_HOP = -1  # entry of the next-hop table where there is no path
 
 
@@ -31,18 +34,23 @@ NO_HOP = -1  # entry of the next-hop table where there is no path
 class PrmConfig:
     """How roadmaps are sampled (paper, sec. III-F)."""
 
-    samples: int = 200  # n
+    samples: int = 200  # n: samples of a roadmap; as many again follow until it joins starts and goals
     connect_m: float = 10.0  # d: longest edge [m]
     margin_m: float = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps none
+    most_samples: int = 25_600  # a roadmap that does not join everything by then stays as it is
 
 
 @struct.dataclass
 class PlanTable:
-    """A roadmap as arrays, for use under jit. May have leading batch axes."""
+    """A roadmap as arrays, for use under jit. May have leading batch axes.
+
+    Column j holds the ways to ``points[goal[j]]``: to every point of a small roadmap, to some of a large one.
+    """
 
     points: Float[Array, "*b n 2"]  # [m]
-    next_hop: Int[Array, "*b n n"]  # int16: next_hop[i, j] is the point after i on a shortest path to j
-    distance: Float[Array, "*b n n"]  # length of that path [m]; inf where there is none
+    goal: Int[Array, "*b m"]
+    next_hop: Int[Array, "*b n m"]  # int16: next_hop[i, j] is the point after i on a shortest path to goal[j]
+    distance: Float[Array, "*b n m"]  # length of that path [m]; inf where there is none
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,10 @@ class Space(Protocol):
         """n points [n, 2] (m), uniform over the area with clearance ``radius`` [m]."""
         ...
 
+    def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
+        """Connected free regions, int [k], of points [k, 2] (m): a robot of ``radius`` [m] never changes its region."""
+        ...
+
 
 @dataclass(frozen=True)
 class Roadmap:
@@ -91,6 +103,7 @@ class Roadmap:
     maze: Maze | Space
     radius_m: float  # of the robot; every edge keeps it clear, and edges between samples the margin too
     config: PrmConfig
+    samples: int  # the first so many points are samples; points that were given follow
 
     @property
     def length(self) -> np.ndarray:
@@ -112,14 +125,35 @@ class Roadmap:
         return csr_array((np.tile(self.length, 2), (both[:, 0], both[:, 1])), shape=(len(self.points),) * 2)
 
     @functools.cached_property
+    def components(self) -> Int[np.ndarray, "n"]:
+        """The connected component of each point."""
+        return connected_components(self._weights, directed=False)[1]
+
+    @functools.cached_property
     def table(self) -> PlanTable:
         """Next hops and distances between all pairs of points."""
-        n = len(self.points)
-        distance, predecessor = dijkstra(self._weights, return_predecessors=True)
+        return self._table(np.arange(len(self.points)))
+
+    def table_to(self, goals: Int[np.ndarray, "k"]) -> PlanTable:
+        """Next hops and distances to some of the points; to all of them where the roadmap is small."""
+        return self.table if len(self.points) <= _ALL_PAIRS else self._table(np.unique(goals))
+
+    def _table(self, goals: Int[np.ndarray, "m"]) -> PlanTable:
+        distance, predecessor = dijkstra(self._weights, indices=goals, return_predecessors=True)
         # The point before i on a path from j is, the graph being undirected, the one after i on the way to j.
         next_hop = np.where(predecessor.T < 0, NO_HOP, predecessor.T).astype(np.int16)
-        np.fill_diagonal(next_hop, np.arange(n))
-        return PlanTable(jnp.asarray(self.points), jnp.asarray(next_hop), jnp.asarray(distance, jnp.float32))
+        next_hop[goals, np.arange(len(goals))] = goals
+        all_pairs = len(goals) == len(self.points)
+        return PlanTable(
+            points=jnp.asarray(self.points),
+            goal=jnp.asarray(goals, jnp.int32),
+            next_hop=jnp.asarray(next_hop),
+            distance=jnp.asarray(distance if all_pairs else distance.T, jnp.float32),
+        )
+
+    def distances(self, pairs: Int[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
+        """Lengths [m] of the shortest paths between pairs of points; inf where there is none."""
+        return dijkstra(self._weights, indices=pairs[:, 0])[np.arange(len(pairs)), pairs[:, 1]].astype(np.float32)
 
     def plan(self, start: np.ndarray, goal: np.ndarray) -> Path | NoPath:
         """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
@@ -139,12 +173,23 @@ class Roadmap:
         return Path(points, float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
 
 
-def build_roadmap(key: jax.Array, maze: Maze | Space, *, radius_m: float, config: PrmConfig | None = None) -> Roadmap:
+def build_roadmap(
+    key: jax.Array,
+    maze: Maze | Space,
+    *,
+    radius_m: float,
+    config: PrmConfig | None = None,
+    ends: Float[np.ndarray, "k 2 2"] | None = None,
+) -> Roadmap:
     """Sample a roadmap: points uniform over the collision-free area, edges wherever the swept robot stays free.
+
+    The first ``config.samples`` are the paper's. A large maze needs more: their number is doubled until the roadmap
+    joins each start to its goal or, without ``ends``, most of its own points to each other.
 
     Args:
         key: the only source of randomness.
         radius_m: of the robot [m]; ``config.margin_m`` is added to it.
+        ends: starts and goals [m], which are not points of the roadmap.
 
     Raises:
         UserError: the maze or world is too narrow for the robot.
@@ -153,22 +198,73 @@ def build_roadmap(key: jax.Array, maze: Maze | Space, *, radius_m: float, config
     radius = radius_m + config.margin_m
     seed = np.asarray(jax.random.key_data(key)).astype(np.uint32)
     rng = np.random.default_rng(seed)
-    points = as_space(maze).sample_free(rng, config.samples, radius).astype(np.float32)
-    nothing = Roadmap(points[:0], np.zeros((0, 2), np.int32), maze, radius_m, config)
-    return extend(nothing, points)
+    space = as_space(maze)
+    roadmap = Roadmap(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.int32), maze, radius_m, config, 0)
+    more = config.samples
+    while True:
+        roadmap = _connect(roadmap, space.sample_free(rng, more, radius).astype(np.float32), sampled=True)
+        more = roadmap.samples
+        if 2 * more > config.most_samples or _suffices(roadmap, ends):
+            return roadmap
+
+
+def _suffices(roadmap: Roadmap, ends: np.ndarray | None) -> bool:
+    """Whether a roadmap joins what lies in one free region: each start to its goal, or most of its own points."""
+    space = as_space(roadmap.maze)
+    if ends is None:
+        region, component = space.regions(roadmap.points, roadmap.radius_m), roadmap.components
+        possible, joined = (int((np.bincount(of) ** 2).sum()) for of in (region, component))
+        return joined >= _JOINED_SHARE * possible
+    region = space.regions(np.asarray(ends).reshape(-1, 2), roadmap.radius_m).reshape(-1, 2)
+    return bool((joins(roadmap, ends) | (region[:, 0] != region[:, 1])).all())
+
+
+def joins(roadmap: Roadmap, ends: Float[np.ndarray, "k 2 2"]) -> Bool[np.ndarray, "k"]:
+    """Whether the roadmap has a path from each start to its goal [m]."""
+    grown = extend(roadmap, np.asarray(ends).reshape(-1, 2))
+    component = grown.components[len(roadmap.points) :].reshape(-1, 2)
+    return component[:, 0] == component[:, 1]
+
+
+def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 2"]:
+    """n pairs of different points that the roadmap joins, each such pair equally likely.
+
+    Raises:
+        UserError: it joins no two of its points.
+    """
+    component = roadmap.components
+    others = np.bincount(component)[component] - 1  # how many pairs begin at each point
+    ends = np.cumsum(others)
+    if not ends[-1]:
+        raise UserError("the roadmap joins no two of its points; sample more of them or connect farther ones")
+    number = np.asarray(jax.random.randint(key, (n,), 0, int(ends[-1])))  # of the pair, in the order of its points
+    first = np.searchsorted(ends, number, side="right")
+    order = np.argsort(component, kind="stable")  # the members of each component, in order
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    begin = np.searchsorted(component[order], component[first])
+    skipped = number - (ends - others)[first]
+    second = begin + skipped + (skipped >= place[first] - begin)
+    return np.stack([first, order[second]], 1)
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
     """The roadmap with further points [k, 2] (m), appended in order and connected wherever the bare robot fits."""
+    return _connect(roadmap, points, sampled=False)
+
+
+def _connect(roadmap: Roadmap, points: np.ndarray, *, sampled: bool) -> Roadmap:
     known = len(roadmap.points)
     points = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
     pairs = _new_pairs(points, known, roadmap.config.connect_m)
+    samples = len(points) if sampled else roadmap.samples
     # Between samples the margin is kept; to given points only the radius.
     clear = np.full(len(pairs), roadmap.radius_m, np.float32)
     if roadmap.config.margin_m:
-        clear += np.float32(roadmap.config.margin_m) * (pairs[:, 1] < roadmap.config.samples)
+        clear += np.float32(roadmap.config.margin_m) * (pairs[:, 1] < samples)
     free = as_space(roadmap.maze).segment_free(points.take(pairs, 0), clear)
-    return replace(roadmap, points=points, edges=np.concatenate([roadmap.edges, pairs.take(np.flatnonzero(free), 0)]))
+    edges = np.concatenate([roadmap.edges, pairs.take(np.flatnonzero(free), 0)])
+    return replace(roadmap, points=points, edges=edges, samples=samples)
 
 
 def _new_pairs(points: np.ndarray, known: int, reach_m: float) -> np.ndarray:
@@ -211,6 +307,13 @@ class MazeSpace:
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
         """As ``Space`` says. Raises UserError where the cells are too narrow."""
         return _sample_points(rng, self.maze, radius, n)
+
+    def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
+        """As ``Space`` says: 4-connected cells, whatever the radius, for a cell's width is larger."""
+        del radius
+        labels, _ = label_regions(~np.asarray(self.maze.walls))
+        column, row = np.floor(np.asarray(points) / float(self.maze.cell_m)).astype(int).T
+        return labels[row, column]
 
 
 _BLOCK = 32_768  # most edges that are checked at once: they stay in the processor's cache and share one program
@@ -286,10 +389,31 @@ def _sample_points(rng: np.random.Generator, maze: Maze, radius: float, n: int) 
     )
 
 
-def stack_tables(roadmaps: list[Roadmap]) -> PlanTable:
-    """Tables of roadmaps of equal size, stacked along a new leading axis."""
-    tables = [roadmap.table for roadmap in roadmaps]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+def stack_tables(tables: list[PlanTable], largest: Callable[[int], int] = int) -> PlanTable:
+    """Tables stacked along a new leading axis. The smaller ones are filled up with points that nothing can see.
+
+    Args:
+        largest: the largest of the numbers that several processes name, so that their tables fit together.
+    """
+    sizes = np.array([table.next_hop.shape for table in tables])
+    n, m = (largest(int(size)) for size in sizes.max(0))
+    if (n, m) != tuple(-largest(-int(size)) for size in sizes.min(0)):
+        n += 1  # a row for the point that filled-up columns lead to
+
+    def grow(table: PlanTable) -> PlanTable:
+        rows, columns = n - table.next_hop.shape[0], m - table.next_hop.shape[1]
+
+        def pad(leaf: jax.Array, more: tuple[int, ...], value: float) -> np.ndarray:
+            return np.pad(np.asarray(leaf), [(0, each) for each in more], constant_values=value)
+
+        return PlanTable(
+            points=pad(table.points, (rows, 0), _NOWHERE_M),
+            goal=pad(table.goal, (columns,), n - 1),
+            next_hop=pad(table.next_hop, (rows, columns), NO_HOP),
+            distance=pad(table.distance, (rows, columns), np.inf),
+        )
+
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *map(grow, tables))
 
 
 @struct.dataclass
@@ -322,12 +446,13 @@ class RoadmapGuide:
         self, tables: PlanTable, which: Int[Array, "N"], maze: Maze, position: jax.Array, goal: jax.Array
     ) -> Following:
         """Connect starts and goals [N, 2] (m) to their roadmaps ``which``; ``maze`` has a leading axis N."""
-        points = tables.points[which]
-        goal_node = self._nearest_in_sight(points, maze, goal)
+        points, goals = tables.points[which], tables.goal[which]
+        column = self._nearest_in_sight(jnp.take_along_axis(points, goals[..., None], 1), maze, goal)
+        goal_node = jnp.take_along_axis(goals, column[:, None], 1)[:, 0]
         plan = Following(
             points=points,
-            next_hop=tables.next_hop[which, :, goal_node].astype(jnp.int32),
-            to_go=tables.distance[which, :, goal_node],
+            next_hop=tables.next_hop[which, :, column].astype(jnp.int32),
+            to_go=tables.distance[which, :, column],
             waypoint=goal_node,
             goal_node=goal_node,
         )

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from ct_envs import UserError
+from ct_envs.robots import TURTLEBOT3
 from ct_envs.turtlebot3 import MAX_NOISE, Turtlebot3Config
 from ct_envs.turtlebot3_pool import Turtlebot3Pool
 from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY, World, load_world
@@ -20,7 +21,7 @@ from ct_jax.checkpoint import write_json
 from ct_jax.collect_turtlebot3 import RoomConfig, collect, keeping
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig
-from ct_jax.evaluate import METHODS, Episodes, Pairs
+from ct_jax.evaluate import METHODS, Episodes, Pairs, check_horizon, horizon_for
 from ct_jax.evaluate_turtlebot3 import draw_room_pairs, draw_rooms, evaluate_rooms, grades
 from ct_jax.finetune_turtlebot3 import recover
 from ct_jax.model import TrainedModel
@@ -108,6 +109,7 @@ class RoomTest:
     seed: int = 0
     density: float = 1.0  # of obstacles, 1 is that of training
     noise: float = 0.0  # level, 1 is that of a real robot
+    horizon: int | None = None  # control steps of an episode; by default in proportion to the longest way
 
     def draw(self) -> tuple[list[World], Pairs]:
         """The rooms, and starts and goals in them: the same for every method. Raises UserError."""
@@ -122,7 +124,7 @@ class RoomTest:
     def measure(self, model: TrainedModel, method: str, worlds: Sequence[World], pairs: Pairs) -> Episodes:
         """Run a method, with a bar."""
         n = len(pairs.start)
-        config = Turtlebot3Config(noise=self.noise)
+        config = Turtlebot3Config(noise=self.noise, horizon=self.horizon or horizon_for(TURTLEBOT3, pairs))
         with (
             Turtlebot3Pool(min(_SLOTS, n), processes=cores(), config=config) as pool,
             Bar(f"{method} in {NAME}", n) as bar,
@@ -148,7 +150,7 @@ def evaluate_seven_pairs(model: TrainedModel, method: str, *, noise: float = 0.0
 
 def evaluate_in_rooms(
     model: TrainedModel, method: str, seed: int, *, worlds: int = 20, pairs: int = 25, density: float = 1.0,
-    noise: float = 0.0,
+    noise: float = 0.0, horizon: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in random rooms; returns its row of the table.
 
@@ -162,5 +164,6 @@ def evaluate_in_rooms(
         raise UserError(f"--density {density}: give a number from 0 to {MAX_FACTOR}; 1 is that of training")
     if not 0 <= noise <= MAX_NOISE:
         raise UserError(f"--noise {noise}: give a level from 0 to {MAX_NOISE}; 1 is that of a real robot")
-    test = RoomTest(worlds, pairs, seed, density, noise)
+    check_horizon(horizon)
+    test = RoomTest(worlds, pairs, seed, density, noise, horizon)
     return test.head(model.robot, method) | test.measure(model, method, *test.draw()).summary()

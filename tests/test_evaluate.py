@@ -10,12 +10,24 @@ from flax import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ct_envs import POINT, MazeEnv, load_maze, make_maze, random_walls
+from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
 from ct_jax.collect import run_episodes
-from ct_jax.evaluate import Episodes, Pairs, bootstrap, draw_pairs, evaluate, wilson
+from ct_jax.evaluate import (
+    Episodes,
+    Pairs,
+    beyond_horizon,
+    bootstrap,
+    check_horizon,
+    draw_pairs,
+    evaluate,
+    horizon_for,
+    shortest_ways,
+    wilson,
+)
 from ct_jax.mazes import head
 from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PrmConfig
 from ct_jax.rollout import act_as_meant
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
@@ -58,12 +70,55 @@ def test_pairs_are_clear_apart_and_joined(pairs, wall_distance, name):
     assert shortest.max() > 1.3 * straight[shortest.argmax()]  # some way leads round a corner
 
 
-def test_pairs_in_a_large_maze_have_finite_ways():
-    """A thousand samples do not join all of a maze of thousands of cells; what is reported are numbers all the same."""
+def test_pairs_in_a_large_maze_have_shortest_ways():
+    """A thousand samples do not join all of a maze of thousands of cells: there are as many as it takes."""
     pairs = draw(make_maze(random_walls(0, height=61, width=61, loops=0.0)), 10)
-    assert np.isfinite(pairs.shortest_m).all()
     straight = np.linalg.norm(pairs.start - pairs.goal, axis=1)
-    assert (pairs.shortest_m >= straight - 1e-3).all()
+    assert pairs.straight == 0
+    assert (pairs.shortest_m >= straight - 1e-3).all() and pairs.shortest_m.max() > 1.5 * straight.max()
+
+
+def test_ways_that_no_roadmap_knows_are_counted():
+    """With hardly a point, the straight line takes the way's place, and is said to be one."""
+    maze = MAZES["antmaze-large"]
+    pairs = draw(maze)
+    config = PrmConfig(samples=5, most_samples=5)
+    way, straight = shortest_ways(
+        jax.random.key(0), maze, pairs.start, pairs.goal, radius_m=POINT.radius_m, config=config
+    )
+    lines = np.isclose(way, np.linalg.norm(pairs.start - pairs.goal, axis=1))
+    assert 0 < straight <= lines.sum()
+    assert episodes(pairs=replace(pairs_of(4), straight=3)).summary()["straight_ways"] == 3
+
+
+# ---------------------------------------------------------------------------------------------------------- horizon
+
+
+def test_the_horizon_grows_with_the_longest_way():
+    """The paper's mazes keep the paper's horizon; a maze with ways k times as long has k times the steps."""
+    for name in ("antmaze-large", "antmaze-large-eval", "hall"):
+        assert horizon_for(POINT, draw(load_maze(name), 100)) == POINT.horizon
+    pairs = pairs_of(3)
+    far = replace(pairs, shortest_m=np.array([10.0, 3 * POINT.way_m, 20.0]))
+    assert horizon_for(POINT, far) == 3 * POINT.horizon
+    assert beyond_horizon(POINT, far, horizon_for(POINT, far)) == 0
+    assert beyond_horizon(POINT, far, 40) == 2  # 13 m
+    for wrong in (0, -5, 10**9):
+        with pytest.raises(UserError, match="--horizon"):
+            check_horizon(wrong)
+
+
+@pytest.mark.parametrize("horizon", [30, None])
+def test_episodes_last_as_long_as_the_horizon(pairs, push, horizon):
+    """And pairs beyond it are counted."""
+    maze, few = MAZES["antmaze-large"], pairs["antmaze-large"]
+    done = evaluate(ENV, maze, few, "planner", controller=push(), horizon=horizon)
+    assert done.horizon == (horizon or ENV.horizon) and done.steps.max() <= done.horizon
+    assert done.summary()["beyond_horizon"] == beyond_horizon(POINT, few, done.horizon)
+    assert done.summary()["not_joined"] == 0
+    if horizon:
+        assert done.timeout.any() and done.summary()["beyond_horizon"] > 0
+        assert (done.steps[done.timeout] == horizon).all()
 
 
 # ------------------------------------------------------------------------------------------------------- statistics
@@ -99,13 +154,18 @@ def test_rates_are_inside_their_intervals(n, data):
     assert 0 <= low <= k / n <= high <= 1
 
 
+def pairs_of(n: int) -> Pairs:
+    return Pairs(np.zeros((n, 2)), np.zeros((n, 2)), np.full(n, 10.0), 3)
+
+
 def episodes(n=4, **changes) -> Episodes:
-    pairs = Pairs(np.zeros((n, 2)), np.zeros((n, 2)), np.full(n, 10.0), 3)
+    pairs = pairs_of(n)
     ones = np.ones(n)
     values = {
         "success": ones > 0, "collided": ones < 0, "fell": ones < 0, "timeout": ones < 0,
         "steps": 20 * ones, "returns": -100 * ones,
         "travelled_m": 10 * ones, "path": np.zeros((5, n, 2), np.float32), "pairs": pairs, "wall_s": 1.0,
+        "horizon": 1000,
     }  # fmt: skip
     return Episodes(**values | changes)
 

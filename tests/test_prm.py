@@ -20,12 +20,14 @@ from ct_jax.prm import (
     PrmConfig,
     RoadmapGuide,
     build_roadmap,
+    draw_joined,
     extend,
+    joins,
     stack_tables,
 )
 
 RADIUS = 0.5
-SMALL = PrmConfig(samples=60)
+SMALL = PrmConfig(samples=60, most_samples=60)
 TWO_ROOMS = parse_walls("#########\n#...#...#\n#...#...#\n#########")
 SEEDS = st.integers(0, 2**31 - 1)
 
@@ -45,6 +47,79 @@ def segment_clearances(wall_distance, walls, a, b) -> np.ndarray:
     return wall_distance(walls, a + share * (b - a)).min(0)
 
 
+# ------------------------------------------------------------------------------------- how many points there are
+
+HALL = np.pad(np.zeros((28, 58), bool), 1, constant_values=True)  # 240 m x 120 m, empty
+COILS = random_walls(5, height=33, width=33, loops=0.0)
+
+
+def corners(walls: np.ndarray, n: int) -> np.ndarray:
+    """n starts and goals [n, 2, 2] (m) of a maze, some of them far apart."""
+    free = (np.argwhere(~walls)[:, ::-1] + 0.5) * 4.0
+    ends = np.linspace(0, len(free) - 1, 2 * n).astype(int)
+    return np.stack([free[ends[:n]], free[ends[::-1][:n]]], 1)
+
+
+@pytest.mark.parametrize("walls", [HALL, COILS], ids=["an empty hall", "a maze of 33 x 33 cells"])
+def test_a_roadmap_grows_until_it_joins_starts_and_goals(walls):
+    maze, ends = make_maze(walls), corners(walls, 12)
+    few = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, config=PrmConfig(most_samples=200))
+    assert few.samples == 200 and not joins(few, ends).all()
+    grown = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, ends=ends)
+    assert joins(grown, ends).all()
+    np.testing.assert_array_equal(grown.points[:200], few.points)
+    halved = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, config=PrmConfig(most_samples=grown.samples // 2))
+    assert not joins(halved, ends).all()  # so many were needed
+
+
+def test_a_roadmap_without_starts_and_goals_joins_most_of_its_own_points():
+    roadmap = build_roadmap(jax.random.key(0), make_maze(HALL), radius_m=RADIUS)
+    largest = max(nx.connected_components(roadmap.graph), key=len)
+    assert len(largest) ** 2 >= 0.4 * len(roadmap.points) ** 2
+
+
+@pytest.mark.parametrize("name", ["antmaze-large", "antmaze-large-eval", "hall"])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_published_number_suffices_in_the_published_mazes(name, seed):
+    assert roadmap_of(name, PrmConfig(), seed).samples == 200
+
+
+def test_what_lies_apart_asks_for_no_more_points():
+    ends = np.array([[[6.0, 6.0], [30.0, 6.0]]])  # in one room and in the other
+    roadmap = build_roadmap(jax.random.key(0), make_maze(TWO_ROOMS), radius_m=RADIUS, config=PrmConfig(60), ends=ends)
+    assert roadmap.samples == 60 and not joins(roadmap, ends).any()
+
+
+@pytest.mark.parametrize("roadmap", [two_rooms, lambda: roadmap_of("antmaze-large", PrmConfig(samples=40))])
+def test_pairs_that_a_roadmap_joins_are_drawn_evenly(roadmap):
+    roadmap = roadmap()
+    pairs = draw_joined(jax.random.key(3), roadmap, 60_000)
+    possible = {(i, j) for part in nx.connected_components(roadmap.graph) for i in part for j in part if i != j}
+    found, count = np.unique(pairs, axis=0, return_counts=True)
+    assert {tuple(pair) for pair in found.tolist()} == possible
+    assert stats.chisquare(count).pvalue > 1e-4
+
+
+def test_a_large_roadmap_has_a_table_of_its_goals_alone():
+    roadmap = build_roadmap(
+        jax.random.key(0), make_maze(HALL), radius_m=RADIUS, config=PrmConfig(samples=2100, connect_m=6.0)
+    )
+    goals = np.array([17, 1500, 17])
+    table = roadmap.table_to(goals)
+    assert table.next_hop.shape == (2100, 2)
+    for column, goal in enumerate(table.goal.tolist()):
+        length = nx.single_source_dijkstra_path_length(roadmap.graph, goal)
+        expected = [length.get(i, np.inf) for i in range(2100)]
+        np.testing.assert_allclose(table.distance[:, column], expected, rtol=1e-5)
+        assert (np.asarray(table.next_hop[:, column]) == NO_HOP).tolist() == np.isinf(expected).tolist()
+        at = 3
+        for _ in range(2100):
+            at = int(table.next_hop[at, column])
+            if at in (goal, NO_HOP):
+                break
+        assert at == (goal if np.isfinite(expected[3]) else NO_HOP)
+
+
 # ------------------------------------------------------------------------------------------- points and edges
 
 
@@ -52,7 +127,7 @@ def segment_clearances(wall_distance, walls, a, b) -> np.ndarray:
 @settings(max_examples=5)
 def test_edges_are_just_the_pairs_within_reach_with_a_free_way(wall_distance, seed, margin_m):
     walls = random_walls(seed, density=0.8)
-    config = PrmConfig(samples=50, connect_m=9.0, margin_m=margin_m)
+    config = PrmConfig(samples=50, connect_m=9.0, margin_m=margin_m, most_samples=50)
     roadmap = build_roadmap(jax.random.key(seed), make_maze(walls), radius_m=RADIUS, config=config)
     clear = RADIUS + margin_m
     assert roadmap.points.shape == (50, 2)
@@ -155,7 +230,7 @@ def test_the_table_holds_shortest_paths(samples, connect_m, pieces):
 
 
 def test_a_roadmap_without_edges_has_no_paths():
-    table = roadmap_of("antmaze-umaze", PrmConfig(samples=10, connect_m=1e-3)).table
+    table = roadmap_of("antmaze-umaze", PrmConfig(samples=10, connect_m=1e-3, most_samples=10)).table
     assert (np.isinf(table.distance) == ~np.eye(10, dtype=bool)).all()
 
 
@@ -237,9 +312,28 @@ def guided(guide: RoadmapGuide, ends: np.ndarray, *, noise: float, length: int =
     """Paths [T, N, 2] of dummies led from the first to the second of ``ends`` [N, 2, 2]."""
     start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
     maze = jax.tree.map(lambda leaf: leaf[WHICH], stack_mazes([load_maze(name) for name in NAMES]))
-    tables = stack_tables([roadmap_of(name, PrmConfig()) for name in NAMES])
+    tables = stack_tables([roadmap_of(name, PrmConfig()).table for name in NAMES])
     plan = jax.jit(guide.init)(tables, jnp.asarray(WHICH), maze, start, goal)
     return np.asarray(walk(guide, plan, maze, start, goal, jax.random.key(0), noise, length))
+
+
+@pytest.mark.parametrize("shortcut", [False, True])
+def test_a_table_of_some_goals_filled_up_to_a_larger_one_leads_as_the_whole_table(shortcut):
+    maze, small = load_maze(NAMES[0]), roadmap_of(NAMES[0], PrmConfig())
+    ends = small.points[[[3, 40], [7, 90]]]
+    columns = np.unique([40, 90])
+    some = small.table.replace(
+        goal=jnp.asarray(columns), next_hop=small.table.next_hop[:, columns], distance=small.table.distance[:, columns]
+    )
+    larger = roadmap_of(NAMES[1], PrmConfig(samples=260)).table
+    guide, mazes = RoadmapGuide(RADIUS, shortcut=shortcut), stack_mazes([maze, maze])
+    start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
+
+    def path(tables):
+        plan = guide.init(tables, jnp.zeros(2, jnp.int32), mazes, start, goal)
+        return np.asarray(walk(guide, plan, mazes, start, goal, jax.random.key(0), 0.0, 200))
+
+    np.testing.assert_array_equal(path(stack_tables([some, larger])), path(stack_tables([small.table])))
 
 
 @pytest.mark.parametrize("shortcut", [False, True])

@@ -69,7 +69,7 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
     if not (padded[[0, -1]].all() and padded[:, [0, -1]].all()):
         raise UserError("maze is free at the border; close it with walls")
 
-    labels, _ = _regions(~padded)
+    labels, _ = label_regions(~padded)
     flat = np.flatnonzero(~padded)
     flat = flat[np.argsort(labels.ravel()[flat], kind="stable")]
     label = labels.ravel()[flat]
@@ -88,7 +88,7 @@ def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, in
     )
 
 
-def _regions(free: np.ndarray) -> tuple[np.ndarray, int]:
+def label_regions(free: np.ndarray) -> tuple[np.ndarray, int]:
     """Label the 4-connected regions of free cells from 1; 0 is wall. And how many there are."""
     return ndimage.label(free)  # pyright: ignore
 
@@ -211,7 +211,7 @@ def random_walls(
     separating[1:-1, 1:-1] &= sides
     walls[separating & (rng.random(walls.shape) < loops)] = False
     walls[walls & inner & (rng.random(walls.shape) > density)] = False
-    labels, count = _regions(~walls)
+    labels, count = label_regions(~walls)
     if count > 1:  # thinning may open cells that touch nothing: fill all but the largest region
         sizes = ndimage.sum_labels(~walls, labels, range(1, count + 1))
         walls = labels != 1 + int(np.argmax(sizes))

@@ -4,6 +4,7 @@ The maze and the tasks (starts and goals) are data that travel in ``state.info``
 have its own and a new maze compiles nothing.
 """
 
+import copy
 from typing import Any
 
 import jax
@@ -79,6 +80,12 @@ class MazeEnv(Env):
         self.horizon = horizon or self.robot.horizon
         self._ctrl_max = self.engine.model.actuator_ctrlrange[:, 1].astype(np.float32)
         self._reset_velocity = self.robot.reset_velocity_mps if reset_velocity_mps is None else reset_velocity_mps
+
+    def with_horizon(self, horizon: int) -> "MazeEnv":
+        """The same environment with episodes of so many control steps."""
+        changed = copy.copy(self)
+        changed.horizon = horizon
+        return changed if horizon != self.horizon else self
 
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

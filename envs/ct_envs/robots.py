@@ -17,6 +17,8 @@ class Robot:
     top_speed_mps: float  # at most this fast, so that no wall is missed within a control step
     control_dt_s: float  # a control step
     horizon: int  # control steps of an episode
+    way_m: float  # longest way for which that horizon is meant; a longer one is given more steps, in proportion
+    cruise_mps: float  # along a shortest way, led by a planner with the full map (measured in antmaze-large-eval)
     goal_tolerance_m: float = 0.5
     reset_velocity_mps: float = 0.0  # standard deviation of the speed after a reset
     reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
@@ -35,6 +37,8 @@ POINT = Robot(
     top_speed_mps=6.0,  # both motors at once give 4 * sqrt(2)
     control_dt_s=0.1,
     horizon=1000,
+    way_m=80.0,
+    cruise_mps=3.28,
 )
 
 ANT = Robot(
@@ -45,6 +49,8 @@ ANT = Robot(
     top_speed_mps=7.0,
     control_dt_s=0.1,
     horizon=1000,
+    way_m=80.0,
+    cruise_mps=1.45,
     reset_velocity_mps=0.1,
     reset_joints_rad=0.1,
     upright_min=0.0,
@@ -60,6 +66,8 @@ HUMANOID = Robot(
     top_speed_mps=7.0,
     control_dt_s=0.03,
     horizon=2000,
+    way_m=80.0,
+    cruise_mps=1.98,
     reset_velocity_mps=0.05,
     reset_joints_rad=0.05,
     height_min_m=1.0,  # it stands at 1.28 m; of Humanoid-v5
@@ -74,6 +82,8 @@ TURTLEBOT3 = Robot(
     top_speed_mps=0.22,
     control_dt_s=0.2,
     horizon=400,  # 80 s, in which the robot drives 17 m
+    way_m=9.0,
+    cruise_mps=0.2,
     goal_tolerance_m=0.2,
     course="room",
 )
