@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import networkx as nx
@@ -11,17 +11,20 @@ import numpy as np
 from jaxtyping import Float
 
 from ct_envs import UserError
-from ct_envs.turtlebot3 import RADIUS_M, to_heading
+from ct_envs.checked import Checked, Within
+from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, to_heading
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
-from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
+from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY, World, random_world
 from ct_jax.checkpoint import read_json, write_json
-from ct_jax.collect import CollectConfig, gather
+from ct_jax.collect import CollectConfig, Guide, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, GuidedDriver, drive, to_trajectories
 from ct_jax.explorer_turtlebot3 import ExplorerGuide
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
+MAX_WORLDS = 1000
+MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # of obstacles against training
 _PAIRS = 200  # starts and goals that are tried in one world
 _APART_M = 1.0  # least distance of start and goal
 _LOOK = 24  # waypoints that are looked at first: mostly one of the best is in sight
@@ -30,13 +33,16 @@ _CLEAR_M = 0.05  # that the explorer keeps to what it saw, half a cell of its gr
 
 
 @dataclass(frozen=True)
-class RoomConfig:
+class RoomConfig(Checked):
     """The rooms of training and evaluation."""
 
-    density: float = 1.0  # of obstacles in training: 1 is what the published numbers are measured in
-    densest: float | None = None  # with this, each room's density is its own, between the two
-    noise: float = 0.0  # level of sensor and motion noise in training; 1 is that of a real robot
-    worlds: int = 20  # rooms of the evaluation (paper)
+    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # of obstacles in training: 1 is what the published numbers
+    # are measured in
+    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # with this, each room's density is its own, between
+    # the two
+    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of sensor and motion noise in training; 1 is that of a
+    # real robot
+    worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # rooms of the evaluation (paper)
 
     @property
     def densities(self) -> tuple[float, float]:
@@ -180,17 +186,15 @@ class ShortcutGuide:
 
 
 AnyGuide = WayGuide | ShortcutGuide | ExplorerGuide
-_GUIDES: dict[str, Callable[[PrmConfig], AnyGuide]] = {
+_GUIDES: dict[Guide, Callable[[PrmConfig], AnyGuide]] = {
     "roadmap": lambda prm: WayGuide(),
     "shortcut": lambda prm: ShortcutGuide(prm.margin_m, prm.connect_m),
     "explorer": lambda prm: ExplorerGuide(RADIUS_M + _CLEAR_M, prm.margin_m),
 }
 
 
-def make_guide(name: str, prm: PrmConfig) -> AnyGuide:
-    """The guide of that name. Raises UserError with the valid names."""
-    if name not in _GUIDES:
-        raise UserError(f"no guide named '{name}' for the Turtlebot3; guides: {', '.join(_GUIDES)}")
+def make_guide(name: Guide, prm: PrmConfig) -> AnyGuide:
+    """The guide of that name."""
     return _GUIDES[name](prm)
 
 

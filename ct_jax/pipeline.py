@@ -26,6 +26,7 @@ from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, tran
 from ct_jax.mazes import MazeCourse, evaluate_in_maze
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model
 from ct_jax.policy import TransformerPolicy
+from ct_jax.presets import MAX_OPTIMISM, MAX_SEED
 from ct_jax.progress import Bar, Metrics
 from ct_jax.rooms import RoomCourse, evaluate_in_rooms
 from ct_jax.run import Run, drop_leftovers, open_run, training
@@ -33,8 +34,6 @@ from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer, with_skill
 from ct_jax.value import ValueNetwork
 
-MAX_SEED = 2**32 - 1
-MAX_OPTIMISM = 10.0
 Progress = Callable[[int, int], None]
 
 

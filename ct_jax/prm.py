@@ -8,7 +8,7 @@ over a ``Maze``, or any other ``Space``.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, clearance, in_sight, segment_free, segment_reach, unpadded
 
@@ -28,12 +29,13 @@ NO_HOP = -1  # entry of the next-hop table where there is no path
 
 
 @dataclass(frozen=True)
-class PrmConfig:
+class PrmConfig(Checked):
     """How roadmaps are sampled (paper, sec. III-F)."""
 
-    samples: int = 200  # n
-    connect_m: float = 10.0  # d: longest edge [m]
-    margin_m: float = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps none
+    samples: Annotated[int, Within(2, 20_000)] = 200  # n
+    connect_m: Annotated[float, Above(0, 10_000)] = 10.0  # d: longest edge [m]
+    margin_m: Annotated[float, Within(0, 100)] = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps
+    # none
 
 
 @struct.dataclass

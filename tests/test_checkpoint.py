@@ -201,7 +201,7 @@ TREE = {
 
 def test_weights_come_back_as_they_were(tmp_path):
     """Also in a structure of shapes only, transposed in memory, and single numbers."""
-    turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6).reshape(2, 3).T}
+    turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6, dtype=np.int32).reshape(2, 3).T}
     save_weights(tmp_path / "w.safetensors", turned)
     assert_same(load_weights(tmp_path / "w.safetensors", turned), turned)
     assert_same(load_weights(tmp_path / "w.safetensors", jax.eval_shape(lambda: turned)), turned)
