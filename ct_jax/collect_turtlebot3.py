@@ -276,10 +276,18 @@ def collect(
     return gather(config, keep(wave), on_progress)
 
 
-def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
+def _are_flags(found: Any, kinds: int, n: int) -> bool:
+    """Whether a value is a list of as many lists of n flags as there are kinds."""
+    lists = [found, *found] if isinstance(found, list) else [found]
+    sizes = [len(each) if isinstance(each, list) else None for each in lists]
+    return sizes == [kinds, *[n] * kinds] and all(isinstance(flag, bool) for each in found for flag in each)
+
+
+def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
     """Waves that are written down in a folder and, after an interruption, read back instead of driven again.
 
     Args:
+        kinds: of flags that a wave has besides its trajectories.
         mend: what the error tells a person to do about a damaged file.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -294,9 +302,13 @@ def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Call
                 save(data, part)
                 part.replace(file)  # last: it says that all is there
             try:
-                return load(file), *(np.array(flag, bool) for flag in read_json(flags_file, mend=mend)["flags"])
+                data = load(file)
             except UserError as bad:
                 raise UserError(f"{bad}: {mend}") from None
+            found = read_json(flags_file, mend=mend).get("flags")
+            if not _are_flags(found, kinds, data.n):
+                raise UserError(f"{flags_file}: not {kinds} flags of {data.n} episodes; {mend}")
+            return data, *np.array(found, bool)
 
         return read_or_drive
 

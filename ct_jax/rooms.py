@@ -64,7 +64,7 @@ class RoomCourse:
         with self._pool(settings.collect.horizon) as pool:
             return collect(
                 key, pool, settings.collect, settings.prm, densities=self.config.densities, controller=controller,
-                on_progress=on_progress, keep=keeping(folder, mend=self.run.mend("collect")),
+                on_progress=on_progress, keep=keeping(folder, kinds=1, mend=self.run.mend("collect")),
             )  # fmt: skip
 
     def recover(
@@ -77,7 +77,7 @@ class RoomCourse:
             return recover(
                 key, pool, policy, settings.recover, settings.collect, settings.prm, densities=self.config.densities,
                 controller=controller, on_progress=on_progress,
-                keep=keeping(folder, mend=self.run.mend("finetune")),
+                keep=keeping(folder, kinds=2, mend=self.run.mend("finetune")),
             )  # fmt: skip
 
     def rows(self, folder: Path, model: TrainedModel) -> Iterator[dict[str, Any]]:

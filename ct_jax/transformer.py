@@ -50,7 +50,9 @@ class ModelConfig(Checked):
     # in the world's frame
     modes: Annotated[int, Within(1, 256)] = 1  # actions to choose from (paper: 1); with one, left or right round an
     # obstacle become straight at it
-    commitment: Annotated[float, Within(0, 1000)] = 0.0  # when acting, keep to the mode chosen before unless another is
+    commitment: Annotated[float, Within(0, 1_000_000)] = (
+        0.0  # when acting, keep to the mode chosen before unless another is
+    )
     # e^commitment times likelier
     skill: bool = False  # the head is the low-level controller, which stays as it is: the trunk tells it where to go
     stride: Annotated[int, Within(1, 1000)] = 1  # control steps from one step of the memory to the next (paper: 1)

@@ -43,7 +43,9 @@ class CqlConfig(Checked):
     discount: Share = 0.99
     reward_scale: Annotated[float, Above(0, 1_000_000)] = 0.1  # of the reward [m] in the critics' units
     alpha: Annotated[float, Within(0, 1_000_000)] = 5.0  # weight of the conservative penalty against the squared error
-    samples: Annotated[int, Within(1, 1000)] = 10  # actions of each kind (uniform, the policy's now, the policy's next)
+    samples: Annotated[int, Within(1, 10_000)] = (
+        10  # actions of each kind (uniform, the policy's now, the policy's next)
+    )
     # behind the penalty
     target_rate: Annotated[float, Above(0, 1)] = 0.05  # share of the new critics in the target critics at each update
     temperature: Annotated[float, Within(0, 1000)] = 1.0  # weight of the policy's entropy, at first; 0: no entropy term
