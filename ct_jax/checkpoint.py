@@ -5,6 +5,7 @@ Both carry SHA-256 sums, and are checked against them before they are trusted.
 
 import hashlib
 import json
+import math
 import shutil
 import sys
 import threading
@@ -21,12 +22,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from ct_envs import UserError
+from ct_envs.checked import shown
 from ct_jax import devices
 from ct_jax.interrupts import rescued_by, uninterrupted
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
 MANIFEST = "SHA256SUMS"  # as ``sha256sum -c`` reads it
+_COMMITTED = "commit_success.txt"  # Orbax's last word: empty of any state
 _DISK_ERRORS = {  # by what is in tensorstore's message
     "RESOURCE_EXHAUSTED": "no space left", "No space left": "no space left", "PERMISSION_DENIED": "no permission",
     "Error writing": "writing fails",
@@ -44,17 +47,25 @@ def _disk_error(error: ValueError) -> str:
 
 def _write_manifest(folder: Path) -> None:
     """Write the sums of all files in a folder, beside them."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    lines = [f"{_sum(file)}  {file.relative_to(folder).as_posix()}\n" for file in files]
+    lines = [f"{_sum(file)}  {name}\n" for name, file in _files(folder)]
     (folder / MANIFEST).write_text("".join(lines), "utf-8")
 
 
 def _check_manifest(folder: Path) -> None:
-    """Raise ValueError unless every file is as it was written, or OSError where one is missing."""
-    for line in (folder / MANIFEST).read_text("utf-8").splitlines():
-        wanted, _, name = line.partition("  ")
-        if _sum(folder / name) != wanted:
+    """Raise ValueError unless every file is as it was written, none is missing and none came later, or OSError."""
+    lines = (folder / MANIFEST).read_text("utf-8").splitlines()
+    written = {name: wanted for wanted, _, name in (line.partition("  ") for line in lines)}
+    found = {name: _sum(file) for name, file in _files(folder)}
+    for name in sorted(written.keys() | found.keys()):
+        if written.get(name) != found.get(name):
             raise ValueError(f"{name} is not as it was written")
+
+
+def _files(folder: Path) -> list[tuple[str, Path]]:
+    """The files of a folder with a manifest, by name, without those that are written after it."""
+    later = (folder / MANIFEST, folder / _COMMITTED)
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file not in later)
+    return [(file.relative_to(folder).as_posix(), file) for file in files]
 
 
 def _sum(file: Path) -> str:
@@ -205,17 +216,26 @@ def _name(path: tuple[Any, ...]) -> str:
     return "/".join(str(getattr(part, "key", getattr(part, "name", getattr(part, "idx", part)))) for part in path)
 
 
-def save_weights(file: Path, tree: Any) -> None:
+def save_weights(file: Path, tree: Any, *, of: Any = None) -> None:
     """Write a pytree of arrays as safetensors, each leaf under its path; a reader never sees half of it.
 
+    Args:
+        of: what JSON says of the model that these are the weights of. A digest of it goes with them, for shapes do not
+            say which function the weights are of: of heads, or of a frame, they know nothing.
+
     Raises:
-        UserError: the disk is full or may not be written to.
+        UserError: a number is not finite, or the disk is full or may not be written to.
     """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     arrays = {_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}
+    for name, array in arrays.items():
+        if not _is_finite(array):
+            raise UserError(f"{file}: '{name}' has become infinite or NaN in training; try a lower learning rate")
     part = file.with_name(file.name + ".part")
+    # One entry, for safetensors writes several in any order, and the same weights are to be the same file.
+    sums = [_sum_of_arrays(arrays)] + ([] if of is None else [_digest(of)])
     try:
-        save_file(arrays, part, metadata={"sha256": _sum_of_arrays(arrays)})
+        save_file(arrays, part, metadata={"sha256": " ".join(sums)})
     except SafetensorError as bad:
         part.unlink(missing_ok=True)
         raise UserError(
@@ -231,6 +251,15 @@ def _sum_of_arrays(arrays: dict[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
+def _digest(of: Any) -> str:
+    """SHA-256 of what JSON holds, however it is written."""
+    return hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()
+
+
+def _is_finite(array: np.ndarray) -> bool:
+    return not np.issubdtype(array.dtype, np.inexact) or bool(np.isfinite(array).all())
+
+
 def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it anew") -> Tree:
     """Read weights into the structure of ``like``.
 
@@ -238,47 +267,95 @@ def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it
         mend: what the error tells a person to do about a damaged file.
 
     Raises:
-        UserError: no safetensors file, a damaged one, or one of other weights (both shapes are shown).
+        UserError: as ``read_weights`` and ``arrange_weights``.
+    """
+    return arrange_weights(file, read_weights(file, mend=mend), like, mend=mend)
+
+
+def read_weights(file: Path, *, of: Any = None, bound: bool = True, mend: str) -> dict[str, np.ndarray]:
+    """The arrays that ``save_weights`` wrote, by name.
+
+    Args:
+        of: as for ``save_weights``, if it was given there.
+        bound: whether the digest of it must be there; what earlier versions wrote has none.
+
+    Raises:
+        UserError: no safetensors file, a damaged one, or the weights of another model.
     """
     try:
         with safe_open(file, framework="np") as opened:
             found, said = {name: opened.get_tensor(name) for name in opened.keys()}, opened.metadata() or {}  # noqa: SIM118
-    except (OSError, SafetensorError) as bad:
+    # NumPy has not all of safetensors' types (AttributeError), nor as many dimensions (ValueError).
+    except (OSError, SafetensorError, AttributeError, TypeError, ValueError) as bad:
         raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {mend}") from None
-    if said.get("sha256", wanted := _sum_of_arrays(found)) != wanted:  # older files have none
+    if "sha256" not in said:
+        raise UserError(f"{file}: without its SHA-256 sum; {mend}")
+    whole, _, described = said["sha256"].partition(" ")
+    if whole != _sum_of_arrays(found):
         raise UserError(f"{file}: not as it was written (SHA-256); {mend}")
+    if of is not None and (bound or described) and described != _digest(of):
+        raise UserError(f"{file}: weights of another model than the one described beside it; {mend}")
+    return found
 
-    def take(path: tuple[Any, ...], leaf: Any) -> np.ndarray:
-        name = _name(path)
+
+def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, mend: str) -> Tree:
+    """The arrays of a file in the structure of ``like``.
+
+    Raises:
+        UserError: an array is missing or too many, not finite, or of another shape or type (both are shown).
+    """
+    wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(like)}
+    for name, leaf in wanted.items():
         if name not in found:
             raise UserError(f"{file}: holds no weights '{name}'; it belongs to another model; {mend}")
-        if found[name].shape != np.shape(leaf):
-            shapes = f"shape {found[name].shape}, this model needs {np.shape(leaf)}"
-            raise UserError(f"{file}: '{name}' has {shapes}; {mend}")
-        return found[name]
-
-    return jax.tree_util.tree_map_with_path(take, like)
+        for what, is_, needed in (
+            ("shape", found[name].shape, np.shape(leaf)), ("type", found[name].dtype, leaf.dtype),
+        ):  # fmt: skip
+            if is_ != needed:
+                raise UserError(f"{file}: '{name}' has {what} {is_}, this model needs {needed}; {mend}")
+        if not _is_finite(found[name]):
+            raise UserError(f"{file}: '{name}' is not finite everywhere; {mend}")
+    for name in found:
+        if name not in wanted:
+            raise UserError(f"{file}: holds weights {shown(name)} besides; it belongs to another model; {mend}")
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: found[_name(path)], like)
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write JSON so that a reader never sees half of it."""
+    """Write JSON so that a reader never sees half of it. Raises UserError for numbers that JSON has not."""
     part = file.with_name(file.name + ".part")
-    part.write_text(json.dumps(value, indent=2) + "\n", "utf-8")
+    try:
+        text = json.dumps(value, indent=2, allow_nan=False)
+    except ValueError:
+        raise UserError(f"{file}: cannot be written (a number is infinite or NaN)") from None
+    part.write_text(text + "\n", "utf-8")
     part.replace(file)
 
 
 def read_json(file: Path, *, mend: str = "delete it and run again") -> dict[str, Any]:
     """Read a JSON object. Raises UserError naming the file, the line and the mend."""
     try:
-        found = json.loads(file.read_text("utf-8"))
+        found = json.loads(file.read_text("utf-8"), parse_constant=_finite, parse_float=_finite)
     except FileNotFoundError:
         raise UserError(f"{file}: no such file") from None
     except json.JSONDecodeError as bad:
         raise UserError(f"{file}:{bad.lineno}: not JSON ({bad.msg}); {mend}") from None
     except UnicodeDecodeError:
         raise UserError(f"{file}: not UTF-8 text; {mend}") from None
+    except RecursionError:
+        raise UserError(f"{file}: nested too deep to be read; {mend}") from None
+    except ValueError as bad:  # a whole number of thousands of digits, or one of ``_finite``
+        raise UserError(f"{file}: {str(bad).partition(';')[0]}; {mend}") from None
     except OSError as bad:
         raise UserError(f"{file}: cannot be read ({bad.strerror})") from None
     if not isinstance(found, dict):
         raise UserError(f"{file}:1: not a JSON object; {mend}")
     return found
+
+
+def _finite(text: str) -> float:
+    """The number of a text. Raises ValueError if it is none: JSON has no NaN and no infinity."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"the number {text[:20]} is not finite")
+    return number

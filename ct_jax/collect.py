@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 from brax.envs.base import State
 
 from ct_envs import MazeEnv, Tasks, UserError
+from ct_envs.checked import Above, Checked, Count, Within
 from ct_envs.maze import Maze, sample_pair
 from ct_jax.devices import data_mesh, fill_up, joined, largest, own, own_rows, place, sharded
 from ct_jax.explorer import ExplorerGuide
@@ -18,22 +20,22 @@ from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, draw_j
 from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
 
-GUIDES = ("roadmap", "shortcut", "explorer")
-STARTS = ("vertices", "maze")
+Guide = Literal["roadmap", "shortcut", "explorer"]
 
 
 @dataclass(frozen=True)
-class CollectConfig:
+class CollectConfig(Checked):
     """Planner-guided collection (paper, Algorithm 3 and sec. IV-A). The defaults are the paper's."""
 
-    trajectories: int = 1000  # T: successes to collect
-    reset_interval: int = 25  # L: episodes on one roadmap
-    guide: str = "roadmap"  # whose plan: "roadmap" point by point, "shortcut" over it, "explorer" (knows no map)
-    starts: str = "vertices"  # starts and goals: roadmap "vertices" (paper) or free points of the "maze"
-    noise: float = 0.0  # size of a disturbance of the actions that is not imitated
-    envs: int = 250  # episodes at a time
-    horizon: int = 400  # steps of an episode
-    give_up: float = 10.0  # stop after this many times T episodes
+    trajectories: Count = 1000  # T: successes to collect
+    reset_interval: Count = 25  # L: episodes on one roadmap
+    guide: Guide = "roadmap"  # whose plan: "roadmap" point by point, "shortcut" over it, "explorer" (knows no map)
+    starts: Literal["vertices", "maze"] = "vertices"  # starts and goals: roadmap "vertices" (paper) or free points of
+    # the "maze"
+    noise: Annotated[float, Within(0, 100)] = 0.0  # size of a disturbance of the actions that is not imitated
+    envs: Annotated[int, Within(1, 100_000)] = 250  # episodes at a time
+    horizon: Annotated[int, Within(1, 1_000_000)] = 400  # steps of an episode
+    give_up: Annotated[float, Above(0, 1_000_000)] = 10.0  # stop after this many times T episodes
 
 
 def run_episodes(
@@ -109,13 +111,11 @@ def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Traject
     )
 
 
-def make_guide(name: str, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | ExplorerGuide:
-    """The guide of that name. Raises UserError with the valid names."""
+def make_guide(name: Guide, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | ExplorerGuide:
+    """The guide of that name."""
     radius, cell_m = env.robot.radius_m, env.engine.cell_m
     if name == "explorer":
         return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, prm.connect_m)
-    if name not in GUIDES:
-        raise UserError(f"no guide named '{name}'; guides: {', '.join(GUIDES)}")
     return RoadmapGuide(radius, prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")
 
 
@@ -206,13 +206,7 @@ class Batch:
 def draw_batch(
     key: jax.Array, env: MazeEnv, mazes: Maze, config: CollectConfig, prm: PrmConfig, *, first_maze: int = 0
 ) -> Batch:
-    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them.
-
-    Raises:
-        UserError: ``config.starts`` means nothing.
-    """
-    if config.starts not in STARTS:
-        raise UserError(f"no starts named '{config.starts}'; starts: {', '.join(STARTS)}")
+    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them."""
     n_maps = max(1, config.envs // config.reset_interval)
     per_map = -(-config.envs // n_maps)
     maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]

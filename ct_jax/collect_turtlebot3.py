@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import networkx as nx
@@ -11,17 +11,20 @@ import numpy as np
 from jaxtyping import Float
 
 from ct_envs import UserError
-from ct_envs.turtlebot3 import RADIUS_M, to_heading
+from ct_envs.checked import Checked, Within
+from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, to_heading
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
-from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
+from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY, World, random_world
 from ct_jax.checkpoint import read_json, write_json
-from ct_jax.collect import CollectConfig, gather
+from ct_jax.collect import CollectConfig, Guide, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, GuidedDriver, drive, to_trajectories
 from ct_jax.explorer_turtlebot3 import ExplorerGuide
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
+MAX_WORLDS = 1000
+MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # of obstacles against training
 _PAIRS = 200  # starts and goals that are tried in one world
 _APART_M = 1.0  # least distance of start and goal
 _LOOK = 24  # waypoints that are looked at first: mostly one of the best is in sight
@@ -30,13 +33,16 @@ _CLEAR_M = 0.05  # that the explorer keeps to what it saw, half a cell of its gr
 
 
 @dataclass(frozen=True)
-class RoomConfig:
+class RoomConfig(Checked):
     """The rooms of training and evaluation."""
 
-    density: float = 1.0  # of obstacles in training: 1 is what the published numbers are measured in
-    densest: float | None = None  # with this, each room's density is its own, between the two
-    noise: float = 0.0  # level of sensor and motion noise in training; 1 is that of a real robot
-    worlds: int = 20  # rooms of the evaluation (paper)
+    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # of obstacles in training: 1 is what the published numbers
+    # are measured in
+    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # with this, each room's density is its own, between
+    # the two
+    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of sensor and motion noise in training; 1 is that of a
+    # real robot
+    worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # rooms of the evaluation (paper)
 
     @property
     def densities(self) -> tuple[float, float]:
@@ -180,17 +186,15 @@ class ShortcutGuide:
 
 
 AnyGuide = WayGuide | ShortcutGuide | ExplorerGuide
-_GUIDES: dict[str, Callable[[PrmConfig], AnyGuide]] = {
+_GUIDES: dict[Guide, Callable[[PrmConfig], AnyGuide]] = {
     "roadmap": lambda prm: WayGuide(),
     "shortcut": lambda prm: ShortcutGuide(prm.margin_m, prm.connect_m),
     "explorer": lambda prm: ExplorerGuide(RADIUS_M + _CLEAR_M, prm.margin_m),
 }
 
 
-def make_guide(name: str, prm: PrmConfig) -> AnyGuide:
-    """The guide of that name. Raises UserError with the valid names."""
-    if name not in _GUIDES:
-        raise UserError(f"no guide named '{name}' for the Turtlebot3; guides: {', '.join(_GUIDES)}")
+def make_guide(name: Guide, prm: PrmConfig) -> AnyGuide:
+    """The guide of that name."""
     return _GUIDES[name](prm)
 
 
@@ -272,10 +276,18 @@ def collect(
     return gather(config, keep(wave), on_progress)
 
 
-def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
+def _are_flags(found: Any, kinds: int, n: int) -> bool:
+    """Whether a value is a list of as many lists of n flags as there are kinds."""
+    lists = [found, *found] if isinstance(found, list) else [found]
+    sizes = [len(each) if isinstance(each, list) else None for each in lists]
+    return sizes == [kinds, *[n] * kinds] and all(isinstance(flag, bool) for each in found for flag in each)
+
+
+def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
     """Waves that are written down in a folder and, after an interruption, read back instead of driven again.
 
     Args:
+        kinds: of flags that a wave has besides its trajectories.
         mend: what the error tells a person to do about a damaged file.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -290,9 +302,13 @@ def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Call
                 save(data, part)
                 part.replace(file)  # last: it says that all is there
             try:
-                return load(file), *(np.array(flag, bool) for flag in read_json(flags_file, mend=mend)["flags"])
+                data = load(file)
             except UserError as bad:
                 raise UserError(f"{bad}: {mend}") from None
+            found = read_json(flags_file, mend=mend).get("flags")
+            if not _are_flags(found, kinds, data.n):
+                raise UserError(f"{flags_file}: not {kinds} flags of {data.n} episodes; {mend}")
+            return data, *np.array(found, bool)
 
         return read_or_drive
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from ct_envs import MazeEnv, UserError
+from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.maze import Maze
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes
 from ct_jax.devices import joined
@@ -20,27 +21,28 @@ from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action, Controller, Guided
 from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, concatenate, select
 
-KEEP = ("separate", "joined", "relabelled")
-
 
 class NoRecoveryError(UserError):
     """There is nothing to fine-tune on: the planner saves none of a policy's episodes, or hardly one wants it."""
 
 
 @dataclass(frozen=True)
-class RecoverConfig:
+class RecoverConfig(Checked):
     """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's where it gives any."""
 
-    recoveries: int = 500  # T
-    stuck_steps: int = 40  # failure: in so many steps ...
-    stuck_m: float = 4.0  # ... the robot moved less than this [m]
-    bumps: int | None = None  # failure: the robot touched a wall in so many of the last ``stuck_steps``
-    patience: int = 200  # failure: not at the goal after so many steps
-    takeover: float = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
-    keep: str = "separate"  # failure and recovery as two trajectories (paper); "joined": one, the failure only seen;
+    recoveries: Count = 500  # T
+    stuck_steps: Annotated[int, Within(1, 100_000)] = 40  # failure: in so many steps ...
+    stuck_m: Annotated[float, Within(0, 10_000)] = 4.0  # ... the robot moved less than this [m]
+    bumps: Annotated[int, Within(1, 100_000)] | None = None  # failure: the robot touched a wall in so many of the last
+    # ``stuck_steps``
+    patience: Annotated[int, Within(1, 1_000_000)] = 200  # failure: not at the goal after so many steps
+    takeover: Share = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
+    keep: Literal["separate", "joined", "relabelled"] = "separate"  # failure and recovery as two trajectories (paper);
+    # "joined": one, the failure only seen;
     # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
-    random_mazes: int = 0  # so many mazes of a generator to fail and recover in, besides the run's
-    give_up: float = 20.0  # stop after this many times T episodes
+    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # so many mazes of a generator to fail and recover in, besides
+    # the run's
+    give_up: Annotated[float, Above(0, 1_000_000)] = 20.0  # stop after this many times T episodes
 
 
 @struct.dataclass
@@ -152,8 +154,6 @@ def gather_recoveries(
     Raises:
         UserError: as ``recover``, NoRecoveryError included.
     """
-    if config.keep not in KEEP:
-        raise UserError(f"recoveries cannot be kept '{config.keep}'; ways: {', '.join(KEEP)}")
     kept: list[Trajectories] = []
     recoveries = episodes = falls = 0
     while recoveries < config.recoveries:

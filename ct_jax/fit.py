@@ -8,7 +8,7 @@ all draw the same windows, each hands over the steps of them that it holds, and 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ct_envs import Robot, UserError
+from ct_envs.checked import Above, Checked, Count, Within
 from ct_envs.frames import symmetries, turns
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
@@ -33,32 +34,35 @@ MODE_SPREAD = 0.05
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Checked):
     """One supervised training (paper, table II)."""
 
-    updates: int = 75_000
-    batch: int = 64  # pieces of trajectories
-    steps: int = 50  # steps of a piece, ``ModelConfig.stride`` apart; with more than K, pieces share their past
-    learning_rate: float = 4e-4
-    weight_decay: float = 1e-3
-    warmup: int = 10_000  # updates of linear warm-up
+    updates: Count = 75_000
+    batch: Annotated[int, Within(1, 1_000_000)] = 64  # pieces of trajectories
+    steps: Annotated[int, Within(1, 100_000)] = 50  # steps of a piece, ``ModelConfig.stride`` apart; with more than K,
+    # pieces share their past
+    learning_rate: Annotated[float, Above(0, 10)] = 4e-4
+    weight_decay: Annotated[float, Within(0, 100)] = 1e-3
+    warmup: Count = 10_000  # updates of linear warm-up
     decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
-    clip: float = 1.0  # norm to which gradients are clipped
+    clip: Annotated[float, Above(0, 1_000_000)] = 1.0  # norm to which gradients are clipped
     mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
     turns: bool = False  # with ``mirror``: only turn the world with the robot in it. A controller that is not symmetric
     # itself has one gait; its mirror image is another, and what learns both learns their mean
-    shift_timestep: int = 0  # add a random number up to this to a piece's timesteps
-    precision: str = "float32"  # of the transformer's computations; "bfloat16" on accelerators, parameters stay float32
+    shift_timestep: Annotated[int, Within(0, 1_000_000)] = 0  # add a random number up to this to a piece's timesteps
+    precision: Literal["float32", "bfloat16"] = "float32"  # of the transformer's computations; "bfloat16" on
+    # accelerators, parameters stay float32
 
 
 @dataclass(frozen=True)
-class ValueConfig:
+class ValueConfig(Checked):
     """The value network's training, and which trajectories it sees (paper, sec. III-C)."""
 
     fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
-    top: float = 1.0  # only the best share X of the trajectories, by return over the straight distance squared
+    top: Annotated[float, Above(0, 1)] = 1.0  # only the best share X of the trajectories, by return over the straight
+    # distance squared
     collision_free: bool = False  # only trajectories without a collision
-    width: int = 128
+    width: Annotated[int, Within(1, 16_384)] = 128
 
 
 @struct.dataclass

@@ -26,6 +26,7 @@ from ct_jax.trajectories import Trajectories
 
 MAX_EPISODES = 100_000
 PICTURES = (".png", ".svg", ".pdf")
+_FAR_M = 1e6  # no maze is so large
 PAIR_ARRAYS = ("start", "goal", "shortest_m")  # and how many of the last are straight lines
 Progress = Callable[[int, int], None]
 
@@ -147,12 +148,27 @@ def _stored_pairs(run: Run, name: str, maze: Maze) -> Pairs:
     file = run.folder / "evaluate" / f"pairs-{slug(name)}-{n}-{seed}.json"
     found = devices.first(lambda: read_json(file) if file.is_file() else None)
     if found is not None:
-        start, goal, shortest_m = (np.asarray(found[name], np.float32) for name in PAIR_ARRAYS)
-        return Pairs(start, goal, shortest_m, seed, straight=int(found.get("straight", 0)))
+        return _read_pairs(file, found, seed)
     pairs = draw_pairs(seed, maze, n, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     arrays = {name: getattr(pairs, name).tolist() for name in PAIR_ARRAYS}
     devices.first(lambda: write_json(file, arrays | {"straight": pairs.straight}))
     return pairs
+
+
+def _read_pairs(file: Path, found: dict[str, Any], seed: int) -> Pairs:
+    """The pairs that a file holds. Raises UserError if they are none."""
+    try:
+        start, goal, shortest_m = (np.asarray(found[name], np.float64) for name in PAIR_ARRAYS)
+        straight = int(found.get("straight", 0))
+    except (KeyError, TypeError, ValueError, OverflowError) as bad:
+        raise UserError(f"{file}: not an evaluation's pairs ({type(bad).__name__}); delete it and run again") from None
+    n = len(shortest_m) if shortest_m.ndim else 0
+    shapes = [array.shape for array in (start, goal, shortest_m)]
+    near = all((np.abs(array) <= _FAR_M).all() for array in (start, goal, shortest_m))
+    if n == 0 or shapes != [(n, 2), (n, 2), (n,)] or not near:
+        raise UserError(f"{file}: not an evaluation's pairs (shapes {shapes}); delete it and run again")
+    start, goal, shortest_m = (array.astype(np.float32) for array in (start, goal, shortest_m))
+    return Pairs(start, goal, shortest_m, seed, straight=straight)
 
 
 def evaluate_in_maze(

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from ct_envs import MazeEnv, UserError
+from ct_envs.checked import shown
 from ct_envs.robots import get_robot
 from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
-from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.policy import TransformerPolicy
@@ -23,6 +24,8 @@ from ct_jax.transformer import ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
 ZOO = "zoo:"
+FORMATS = (1, 2)  # of model.json and controller.json
+BOUND = 2  # from this format on, weights are bound to what the file beside them says of them
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,9 @@ def save_model(folder: Path, model: TrainedModel) -> None:
     """Write a model into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.json").unlink(missing_ok=True)  # written last: it says that the weights are whole
-    save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller))
-    write_json(
-        folder / "model.json",
-        {"format": 1, "robot": model.robot, "settings": to_dict(model.settings), "made": model.made},
-    )
+    said = {"robot": model.robot, "settings": to_dict(model.settings)}
+    save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller), of=said)
+    write_json(folder / "model.json", {"format": BOUND} | said | {"made": model.made})
 
 
 def zoo_names() -> list[str]:
@@ -81,27 +82,45 @@ def load_model(run: str) -> TrainedModel:
     folder = model_folder(run)
     file = folder / "model.json"
     mend = f"delete {folder} and continue the run with --resume" if folder.name == "model" else "fetch it anew"
-    meta = read_json(file, mend=mend)
+    found, bound = _read_description(file, mend)
+    said = {name: found.get(name) for name in ("robot", "settings")}
     try:
-        robot, made = meta["robot"], meta.get("made", {})
-        settings = from_dict(meta["settings"])
-        get_robot(robot)
-    except (KeyError, TypeError, UserError) as bad:
+        robot, settings = get_robot(said["robot"]).name, from_dict(said["settings"])
+        _check_robot(robot, settings)
+    except UserError as bad:
         raise UserError(f"{file}: not a model's description ({bad}); {mend}") from None
+    weights = folder / "weights.safetensors"
+    arrays = read_weights(weights, of=said, bound=bound, mend=mend)
     policy, controller = blank_model(robot, settings)
-    like = _arrays(policy, controller)
-    arrays = jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", like, mend=mend))
+    arrays = jax.tree.map(jnp.asarray, arrange_weights(weights, arrays, _arrays(policy, controller), mend=mend))
     policy = replace(policy, params=arrays["transformer"], value_params=arrays["value"])
     if isinstance(controller, SacController):
         controller = replace(controller, normalizer=arrays["normalizer"], policy=arrays["controller"])
-    return TrainedModel(robot, settings, policy, controller, made)
+    return TrainedModel(robot, settings, policy, controller, found["made"])
+
+
+def _read_description(file: Path, mend: str) -> tuple[dict[str, Any], bool]:
+    """What ``model.json`` or ``controller.json`` says, and whether the weights must be bound to it.
+
+    Raises:
+        UserError: no JSON, or of a format that this version does not know.
+    """
+    found = {"made": {}} | read_json(file, mend=mend)
+    number = found.get("format")
+    if type(number) is not int or number not in FORMATS:
+        known = " and ".join(map(str, FORMATS))
+        raise UserError(f"{file}: of format {shown(number)}; this version of ct-jax reads {known}; {mend}")
+    if not isinstance(found["made"], dict):
+        raise UserError(f"{file}: 'made' is {shown(found['made'])}, not an object; {mend}")
+    return found, number >= BOUND
 
 
 def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
     """Write a controller into a folder: ``weights.safetensors``, and last ``controller.json``."""
     folder.mkdir(parents=True, exist_ok=True)
-    save_weights(folder / "weights.safetensors", controller)
-    write_json(folder / "controller.json", _sizes(robot) | {"format": 1, "sac": asdict(config), "made": made})
+    said = {"robot": robot, "sac": asdict(config)}
+    save_weights(folder / "weights.safetensors", controller, of=said)
+    write_json(folder / "controller.json", _sizes(robot) | said | {"format": BOUND, "made": made})
 
 
 def load_controller(
@@ -117,18 +136,25 @@ def load_controller(
     """
     folder = _controller_folder(where, robot)
     file = folder / "controller.json"
-    found = read_json(file, mend=mend)
+    found, bound = _read_description(file, mend)
     needed = _sizes(robot)
     sizes = {name: found.get(name) for name in needed}
     if sizes != needed:
-        words = [", ".join(f"{name} {value}" for name, value in each.items()) for each in (sizes, needed)]
+        words = [
+            ", ".join(f"{name} {shown(value, quoted=False)}" for name, value in each.items())
+            for each in (sizes, needed)
+        ]
         raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {mend}")
+    said = {name: found.get(name) for name in ("robot", "sac")}
     try:
-        config = sac_from_dict(found["sac"])
-    except (KeyError, TypeError, AttributeError) as bad:
+        config = sac_from_dict(said["sac"])
+        _check_robot(robot, Settings(sac=config))
+    except UserError as bad:
         raise UserError(f"{file}: not a controller's description ({bad}); {mend}") from None
-    blank = jax.eval_shape(lambda key: _blank_sac(key, robot, config), jax.random.key(0))
-    return jax.tree.map(jnp.asarray, load_weights(folder / "weights.safetensors", blank, mend=mend)), config
+    weights = folder / "weights.safetensors"
+    arrays = read_weights(weights, of=said, bound=bound, mend=mend)
+    controller = arrange_weights(weights, arrays, _blank_sac(robot, config), mend=mend)
+    return jax.tree.map(jnp.asarray, controller), config
 
 
 def copy_controller(where: str, robot: str, folder: Path) -> None:
@@ -164,11 +190,14 @@ def sizes(robot: str) -> tuple[int, int]:
 
 
 def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController | DifferentialDrive]:
-    """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays."""
+    """A policy and a controller of the right sizes, with the shapes of their arrays in place of the arrays.
+
+    Raises:
+        UserError: settings that are not for the robot.
+    """
+    _check_robot(robot, settings)
     proprio_size, action_size = sizes(robot)
     maps, proprio, goal, *rest = sample_inputs(proprio_size, action_size)
-    if settings.model.skill and get_robot(robot).course == "room":
-        raise UserError(f"model.skill is for a controller that was learned; the {robot}'s is known")
     sac = settings.sac if settings.model.skill else None
     transformer = ControlTransformer(settings.model, action_size, sac)
     value = ValueNetwork(settings.value.width)
@@ -188,11 +217,21 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     policy = jax.eval_shape(build, jax.random.key(0))
     if get_robot(robot).course == "room":
         return policy, DifferentialDrive()
-    return policy, jax.eval_shape(lambda key: _blank_sac(key, robot, settings.sac), jax.random.key(0))
+    return policy, _blank_sac(robot, settings.sac)
 
 
-def _blank_sac(key: jax.Array, robot: str, config: SacConfig) -> SacController:
-    return blank_controller(key, *sizes(robot), config)
+def _check_robot(robot: str, settings: Settings) -> None:
+    """Raise UserError for settings that are not for the robot."""
+    if settings.model.skill and get_robot(robot).course == "room":
+        raise UserError(f"model.skill is for a controller that was learned; the {robot}'s is known")
+    for name, frame in (("model", settings.model.frame), ("sac", settings.sac.frame)):
+        if frame == "heading" and not get_robot(robot).has_heading:
+            raise UserError(f"{name}.frame is 'heading', which the {robot} has not; give 'world'")
+
+
+def _blank_sac(robot: str, config: SacConfig) -> SacController:
+    """A controller with the shapes of its arrays."""
+    return jax.eval_shape(lambda key: blank_controller(key, *sizes(robot), config), jax.random.key(0))
 
 
 def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive) -> dict[str, Any]:

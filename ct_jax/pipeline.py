@@ -24,17 +24,16 @@ from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import METHODS
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.mazes import MazeCourse, evaluate_in_maze
-from ct_jax.model import TrainedModel, blank_model, load_model, save_model
+from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
 from ct_jax.policy import TransformerPolicy
+from ct_jax.presets import MAX_OPTIMISM, MAX_SEED
 from ct_jax.progress import Bar, Metrics
 from ct_jax.rooms import RoomCourse, evaluate_in_rooms
-from ct_jax.run import Run, drop_leftovers, open_run, training
+from ct_jax.run import Run, drop_leftovers, is_row, open_run, training
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer, with_skill
 from ct_jax.value import ValueNetwork
 
-MAX_SEED = 2**32 - 1
-MAX_OPTIMISM = 10.0
 Progress = Callable[[int, int], None]
 
 
@@ -120,10 +119,16 @@ def planning_trajectories(run: Run, course: Course, controller: Any) -> Trajecto
 
 
 def _read_trajectories(run: Run, file: Path) -> Trajectories:
+    """What ``storage.save`` wrote in the run. Raises UserError if it is damaged, or another run's."""
     try:
-        return storage.load(file)
+        data = storage.load(file)
     except UserError as bad:
         raise UserError(f"{bad}: {run.mend(file.parent.name)}") from None
+    mazes = len(run.mazes) + max(run.settings.random_mazes, run.settings.recover.random_mazes)
+    fits = (data.proprio.shape[-1], data.action.shape[-1]) == sizes(run.robot)
+    if not fits or (data.map_bits is None) != bool(run.mazes) or np.max(data.maze, initial=0) >= max(mazes, 1):
+        raise UserError(f"{file}: trajectories of another run; {run.mend(file.parent.name)}")
+    return data
 
 
 def describe(data: Trajectories) -> dict[str, Any]:
@@ -238,8 +243,13 @@ def _evaluate(run: Run, course: Course, model: TrainedModel) -> None:
 
 
 def results(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a run's table."""
-    return read_json(folder / "evaluate" / "results.json")["rows"]
+    """The rows of a run's table. Raises UserError if they are damaged."""
+    file = folder / "evaluate" / "results.json"
+    mend = f"delete {file.parent} and continue with --resume"
+    rows = read_json(file, mend=mend).get("rows")
+    if not isinstance(rows, list) or not all(map(is_row, rows)):
+        raise UserError(f"{file}: not the rows of a table; {mend}")
+    return rows
 
 
 def evaluate_model(

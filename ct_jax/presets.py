@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 from ct_envs import UserError
+from ct_envs.checked import Above, Checked, Within, from_json
 from ct_envs.lidar import LIDAR_CELL_M
 from ct_envs.robots import get_robot
 from ct_jax.collect import CollectConfig
@@ -15,28 +16,34 @@ from ct_jax.fit import FitConfig, ValueConfig
 from ct_jax.prm import PrmConfig
 from ct_jax.transformer import ModelConfig
 
+MAX_SEED = 2**32 - 1
+MAX_OPTIMISM = 10.0
+
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Checked):
     """Everything a run depends on besides its robot, mazes, engine and seed."""
 
     prm: PrmConfig = PrmConfig()
     controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
     sac: SacConfig = SacConfig()
-    controller_effort: float = 1.0  # of a learned controller's actions, when it leads: with less it falls less
+    controller_effort: Annotated[float, Above(0, 1)] = 1.0  # of a learned controller's actions, when it leads: with
+    # less it falls less
     collect: CollectConfig = CollectConfig()
     model: ModelConfig = ModelConfig()
     value: ValueConfig = ValueConfig()
     fit: FitConfig = FitConfig()
     recover: RecoverConfig = RecoverConfig()
-    rounds: int = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
+    rounds: Annotated[int, Within(0, 1000)] = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
     round_fit: FitConfig | None = None  # the training in each round but the last; by default as ``fit``
     last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
-    optimism: float = 1.0  # k: ask for k * V (paper, sec. III-C)
+    optimism: Annotated[float, Above(0, MAX_OPTIMISM)] = 1.0  # k: ask for k * V (paper, sec. III-C)
     reprompt: bool = False  # never ask for more than V of the present state
-    random_mazes: int = 0  # so many mazes of a generator to collect and recover in, besides the named ones
-    episodes: int = 100  # start-goal pairs of the evaluation in each maze (paper)
-    pairs_seed: int = 0  # their seed: not the run's, so that all models meet the same pairs
+    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # so many mazes of a generator to collect and recover in,
+    # besides the named ones
+    episodes: Annotated[int, Within(1, 100_000)] = 100  # start-goal pairs of the evaluation in each maze (paper)
+    pairs_seed: Annotated[int, Within(0, MAX_SEED)] = 0  # their seed: not the run's, so that all models meet the same
+    # pairs
     rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
 
 
@@ -296,26 +303,11 @@ def _without_later(values: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def from_dict(values: dict[str, Any]) -> Settings:
-    """The settings that ``to_dict`` gave. Raises UserError if they are of another version."""
-    try:
-        value = values["value"] | {"fit": FitConfig(**values["value"]["fit"])}
-        return replace(
-            Settings(**{k: v for k, v in values.items() if not isinstance(v, dict)}),
-            prm=PrmConfig(**values["prm"]),
-            sac=sac_from_dict(values["sac"]),
-            collect=CollectConfig(**values["collect"]),
-            model=ModelConfig(**values["model"]),
-            value=ValueConfig(**value),
-            fit=FitConfig(**values["fit"]),
-            recover=RecoverConfig(**values["recover"]),
-            rooms=RoomConfig(**values["rooms"]) if "rooms" in values else None,
-            **{name: FitConfig(**values[name]) if values[name] else None for name in ("round_fit", "last_fit")},
-        )
-    except (KeyError, TypeError, AttributeError) as bad:
-        raise UserError(f"settings of another version ({bad}); train again") from None
+def from_dict(values: Any) -> Settings:
+    """The settings that ``to_dict`` gave. Raises UserError if they are of another version, or out of their ranges."""
+    return from_json(Settings, values, "settings")
 
 
-def sac_from_dict(values: dict[str, Any]) -> SacConfig:
+def sac_from_dict(values: Any) -> SacConfig:
     """The controller's part of ``from_dict``."""
-    return SacConfig(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})
+    return from_json(SacConfig, values, "sac")

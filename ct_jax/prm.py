@@ -8,7 +8,7 @@ over a ``Maze``, or any other ``Space``.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, clearance, in_sight, label_regions, segment_free, segment_reach, unpadded
 
@@ -31,13 +32,15 @@ NO_HOP = -1  # entry of the next-hop table where there is no path
 
 
 @dataclass(frozen=True)
-class PrmConfig:
+class PrmConfig(Checked):
     """How roadmaps are sampled (paper, sec. III-F)."""
 
-    samples: int = 200  # n: samples of a roadmap; as many again follow until it joins starts and goals
-    connect_m: float = 10.0  # d: longest edge [m]
-    margin_m: float = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps none
-    most_samples: int = 25_600  # a roadmap that does not join everything by then stays as it is
+    samples: Annotated[int, Within(2, 20_000)] = 200  # n; as many again follow until the roadmap joins starts and goals
+    connect_m: Annotated[float, Above(0, 10_000)] = 10.0  # d: longest edge [m]
+    margin_m: Annotated[float, Within(0, 100)] = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps
+    # none
+    most_samples: Annotated[int, Within(2, 30_000)] = 25_600  # a roadmap that does not join everything by then stays as
+    # it is; a point's number is kept in 16 bits
 
 
 @struct.dataclass

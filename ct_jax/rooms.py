@@ -16,9 +16,9 @@ from ct_envs import UserError
 from ct_envs.robots import TURTLEBOT3
 from ct_envs.turtlebot3 import MAX_NOISE, Turtlebot3Config
 from ct_envs.turtlebot3_pool import Turtlebot3Pool
-from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY, World, load_world
+from ct_envs.turtlebot3_world import World, load_world
 from ct_jax.checkpoint import write_json
-from ct_jax.collect_turtlebot3 import RoomConfig, collect, keeping
+from ct_jax.collect_turtlebot3 import MAX_FACTOR, MAX_WORLDS, RoomConfig, collect, keeping
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import METHODS, Episodes, Pairs, check_horizon, horizon_for
@@ -31,8 +31,7 @@ from ct_jax.run import Run, cores, kept_row
 from ct_jax.trajectories import Trajectories
 
 NAME = "rooms"  # of all rooms of an evaluation together, where a maze's name stands
-MAX_WORLDS, MAX_PAIRS = 1000, 1000
-MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # of obstacles against training
+MAX_PAIRS = 1000
 SEVEN_SEED = 7  # of the seven pairs
 _SLOTS = 50  # episodes of an evaluation at a time
 Progress = Callable[[int, int], None]
@@ -66,7 +65,7 @@ class RoomCourse:
         with self._pool(settings.collect.horizon) as pool:
             return collect(
                 key, pool, settings.collect, settings.prm, densities=self.config.densities, controller=controller,
-                on_progress=on_progress, keep=keeping(folder, mend=self.run.mend("collect")),
+                on_progress=on_progress, keep=keeping(folder, kinds=1, mend=self.run.mend("collect")),
             )  # fmt: skip
 
     def recover(
@@ -79,7 +78,7 @@ class RoomCourse:
             return recover(
                 key, pool, policy, settings.recover, settings.collect, settings.prm, densities=self.config.densities,
                 controller=controller, on_progress=on_progress,
-                keep=keeping(folder, mend=self.run.mend("finetune")),
+                keep=keeping(folder, kinds=2, mend=self.run.mend("finetune")),
             )  # fmt: skip
 
     def rows(self, folder: Path, model: TrainedModel) -> Iterator[dict[str, Any]]:

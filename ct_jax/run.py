@@ -34,6 +34,7 @@ from ct_jax.evaluate import Episodes
 from ct_jax.presets import Settings, to_dict
 from ct_jax.progress import Bar, Metrics
 
+_ROW = {"method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "collision_rate", "steps_mean"}
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
 
 
@@ -81,8 +82,12 @@ class Run:
     @property
     def made(self) -> dict[str, Any]:
         """What made the run, for what is shipped of it."""
-        config = read_json(self.folder / "config.json")
-        return {name: config[name] for name in ("command", "commit", "created", "hardware", "versions", "seed")}
+        file = self.folder / "config.json"
+        config, names = read_json(file), ("command", "commit", "created", "hardware", "versions", "seed")
+        missing = [name for name in names if name not in config]
+        if missing:
+            raise UserError(f"{file}: '{missing[0]}' is missing; restore the file")
+        return {name: config[name] for name in names}
 
     def mend(self, stage: str) -> str:
         """What to do about a damaged file of a stage."""
@@ -96,7 +101,10 @@ class Run:
 
         def begin() -> float:
             folder.mkdir(exist_ok=True)
-            return float(read_json(file).get("wall_s", 0.0)) if file.is_file() else 0.0
+            spent = read_json(file).get("wall_s") if file.is_file() else 0.0
+            if not isinstance(spent, int | float):
+                raise UserError(f"{file}: 'wall_s' is no number; delete it and run again")
+            return float(spent)
 
         before = devices.first(begin)
         info: dict[str, Any] = {}
@@ -156,7 +164,26 @@ def kept_row(
             write_json(file, head | episodes.summary())
 
         devices.first(keep)
-    return devices.first(lambda: read_json(file))
+    row = devices.first(lambda: read_json(file))
+    if not is_row(row):
+        raise UserError(f"{file}: not a row of a table; delete it and run again")
+    return row
+
+
+def is_row(row: Any) -> bool:
+    """Whether a value can stand in a table: what ``Episodes.summary`` makes, and what it is of."""
+
+    def is_number(value: Any) -> bool:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+
+    def is_right(name: str, value: Any) -> bool:
+        if name in ("robot", "method", "maze"):
+            return isinstance(value, str)
+        if name.endswith("_ci95"):
+            return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
+        return not name.endswith(("_rate", "_mean", "_scaled", "spl")) or is_number(value)
+
+    return isinstance(row, dict) and row.keys() >= _ROW and all(is_right(name, value) for name, value in row.items())
 
 
 def episodes_file(folder: Path, name: str, method: str) -> Path:

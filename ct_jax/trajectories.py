@@ -5,8 +5,6 @@ thousand trajectories take megabytes, not gigabytes. What a lidar showed cannot 
 to the byte.
 """
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import jax
@@ -16,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt8
 
 from ct_envs import UserError
+from ct_envs.checked import shown
 from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
@@ -27,6 +26,15 @@ _MAP_BITS = 2 * MAP_CELLS**2
 
 PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
 OBSERVED = ("seen", "map_bits")  # per step, too, where they are kept
+
+# Axes and kinds of the arrays of ``Trajectories``.
+_ARRAYS: dict[str, tuple[tuple[str | int, ...], type[np.generic]]] = {
+    "position": (("N", "T", 2), np.floating), "proprio": (("N", "T", "P"), np.floating),
+    "action": (("N", "T", "A"), np.floating), "target": (("N", "T", "A"), np.floating),
+    "reward": (("N", "T"), np.floating), "learn": (("N", "T"), np.floating), "collision": (("N", "T"), np.floating),
+    "goal": (("N", 2), np.floating), "maze": (("N",), np.integer), "length": (("N",), np.integer),
+    "seen": (("N", "T", 2), np.floating), "map_bits": (("N", "T", -(-_MAP_BITS // 8)), np.uint8),
+}  # fmt: skip
 
 
 @struct.dataclass
@@ -150,9 +158,46 @@ def _found(file: Path) -> list[Path]:
 def _load(file: Path) -> Trajectories:
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as data:
-            return Trajectories(**{name: data[name] for name in data.files})
-    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as bad:
+            found = {name: data[name] for name in data.files}
+    except Exception as bad:  # a torn archive fails in a dozen ways
         raise UserError(f"{file}: not a trajectory file ({type(bad).__name__}); collect again") from None
+    wrong = _wrong(found)
+    if wrong:
+        raise UserError(f"{file}: not a trajectory file ({wrong}); collect again")
+    return Trajectories(**found)
+
+
+def _wrong(found: dict[str, np.ndarray]) -> str:
+    """What keeps arrays from being trajectories; empty if nothing does."""
+    sizes: dict[str, int] = {}  # of the axes, the same in all arrays
+    for name, (axes, kind) in _ARRAYS.items():
+        if name not in found:
+            if name in OBSERVED and not any(other in found for other in OBSERVED):
+                continue
+            return f"{name} is missing"
+        array = found[name]
+        if not np.issubdtype(array.dtype, kind):
+            return f"{name} is of {array.dtype}"
+        if array.ndim != len(axes) or any(
+            size != (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
+            for axis, size in zip(axes, array.shape, strict=True)
+        ):
+            return f"{name} is of shape {array.shape}"
+    more = [name for name in found if name not in _ARRAYS]
+    if more:
+        return f"it holds {shown(more[0])}, too"
+    length, steps = found["length"], sizes["T"]
+    if not ((length >= 0) & (length <= steps)).all():
+        return f"a length is not from 0 to {steps}"
+    if (found["maze"] < 0).any():
+        return "a maze has a negative number"
+    inside = np.arange(steps) < length[:, None]
+    for name, (axes, kind) in _ARRAYS.items():
+        if name in found and kind is np.floating:
+            used = found[name][inside] if "T" in axes else found[name]
+            if not np.isfinite(used).all():
+                return f"{name} is not finite"
+    return ""
 
 
 @struct.dataclass

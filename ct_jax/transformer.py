@@ -8,7 +8,7 @@ and so on, K of them: s times the memory at the cost of one.
 
 import functools
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -18,7 +18,9 @@ from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ct_envs.frames import own_frame, turn
+from ct_envs import UserError
+from ct_envs.checked import Above, Checked, Within
+from ct_envs.frames import FrameName, own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
 from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.dense import Dense, Dropout
@@ -30,25 +32,35 @@ SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
 
 
 @dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Checked):
     """Sizes of the transformer (paper, table II)."""
 
-    layers: int = 4
-    heads: int = 4
-    width: int = 128  # embedding dimension
-    context: int = 50  # K [steps] in training
-    context_acting: int = 50  # K [steps] when acting
-    dropout: float = 0.1
-    max_timestep: int = 1024  # embeddings of the absolute timestep
-    map_cell_m: float = 0.8  # side of a cell of the local map [m]
+    layers: Annotated[int, Within(1, 64)] = 4
+    heads: Annotated[int, Within(1, 64)] = 4
+    width: Annotated[int, Within(1, 16_384)] = 128  # embedding dimension
+    context: Annotated[int, Within(1, 10_000)] = 50  # K [steps] in training
+    context_acting: Annotated[int, Within(1, 10_000)] = 50  # K [steps] when acting
+    dropout: Annotated[float, Within(0, 0.99)] = 0.1
+    max_timestep: Annotated[int, Within(1, 1_000_000)] = 1024  # embeddings of the absolute timestep
+    map_cell_m: Annotated[float, Above(0, 100)] = 0.8  # side of a cell of the local map [m]
     returns: bool = True  # condition on returns; without them this is BC-CT
     actions: bool = True  # see its own past actions, as the paper's does; without them, it cannot repeat itself
-    frame: str = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
-    directions: int = 16  # with "heading": planar vectors that the trunk hands to the body, in the world's frame
-    modes: int = 1  # actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it
-    commitment: float = 0.0  # when acting, keep to the mode chosen before unless another is e^commitment times likelier
+    frame: FrameName = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
+    directions: Annotated[int, Within(1, 1024)] = 16  # with "heading": planar vectors that the trunk hands to the body,
+    # in the world's frame
+    modes: Annotated[int, Within(1, 256)] = 1  # actions to choose from (paper: 1); with one, left or right round an
+    # obstacle become straight at it
+    commitment: Annotated[float, Within(0, 1_000_000)] = (
+        0.0  # when acting, keep to the mode chosen before unless another is
+    )
+    # e^commitment times likelier
     skill: bool = False  # the head is the low-level controller, which stays as it is: the trunk tells it where to go
-    stride: int = 1  # control steps from one step of the memory to the next (paper: 1)
+    stride: Annotated[int, Within(1, 1000)] = 1  # control steps from one step of the memory to the next (paper: 1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width % self.heads:
+            raise UserError(f"ModelConfig.width is {self.width}; give a multiple of heads, {self.heads}")
 
     @property
     def tokens(self) -> int:

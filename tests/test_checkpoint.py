@@ -133,6 +133,21 @@ def test_whatever_happens_to_a_file_the_one_before_is_taken(tmp_path, damage, ca
     assert restored(folder) == (2, {2.0})
 
 
+@pytest.mark.parametrize("change", ["nothing", "one line", "one file more"])
+def test_a_manifest_is_of_all_files_or_the_state_is_not_trusted(tmp_path, change):
+    saved(tmp_path, 1, 2)
+    state = tmp_path / "2" / "default"
+    manifest = state / checkpoint.MANIFEST
+    match change:
+        case "nothing":
+            manifest.write_text("")
+        case "one line":
+            manifest.write_text("".join(manifest.read_text().splitlines(keepends=True)[:-1]))
+        case _:
+            (state / "d" / "more").write_bytes(b"")
+    assert restored(tmp_path) == (1, {1.0})
+
+
 def test_where_none_is_whole_training_begins_anew(tmp_path, capsys):
     saved(tmp_path, 1, 2)
     for step in (1, 2):
@@ -201,10 +216,16 @@ TREE = {
 
 def test_weights_come_back_as_they_were(tmp_path):
     """Also in a structure of shapes only, transposed in memory, and single numbers."""
-    turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6).reshape(2, 3).T}
+    turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6, dtype=np.int32).reshape(2, 3).T}
     save_weights(tmp_path / "w.safetensors", turned)
     assert_same(load_weights(tmp_path / "w.safetensors", turned), turned)
     assert_same(load_weights(tmp_path / "w.safetensors", jax.eval_shape(lambda: turned)), turned)
+
+
+def test_the_same_weights_are_the_same_file(tmp_path):
+    for name in "abcdefgh":
+        save_weights(tmp_path / name, TREE, of={"robot": "point"})
+    assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
 
 
 def test_other_weights_are_refused_with_both_shapes(tmp_path):
@@ -274,6 +295,32 @@ def test_json_errors_name_the_file_and_the_line(tmp_path):
         read_json(tmp_path / "gone.json")
     with pytest.raises(UserError, match=tmp_path.name):
         read_json(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"a": NaN}', "the number NaN is not finite"),
+        ('{"a": -Infinity}', "the number -Infinity is not finite"),
+        ('{"a": 1e999}', "the number 1e999 is not finite"),
+        ('{"a": ' + "9" * 5000 + "}", "Exceeds the limit"),
+        ('{"a": ' + "[" * 100_000 + "}", "nested too deep"),
+        ('{"a": ' * 100_000, "nested too deep"),
+    ],
+    ids=lambda text: text[:12],
+)
+def test_numbers_and_depths_that_json_has_not_are_one_line(tmp_path, text, words):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(UserError, match=rf"x\.json: {words}.*; mend it") as caught:
+        read_json(tmp_path / "x.json", mend="mend it")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+
+
+def test_what_could_not_be_read_is_not_written(tmp_path):
+    write_json(tmp_path / "x.json", {"old": 1})
+    with pytest.raises(UserError, match=r"x\.json: cannot be written \(a number is infinite or NaN\)"):
+        write_json(tmp_path / "x.json", {"new": float("nan")})
+    assert read_json(tmp_path / "x.json") == {"old": 1}
 
 
 def test_without_compilation(tmp_path, jit_disabled):

@@ -319,7 +319,7 @@ def test_an_unfinished_run_has_no_model_yet(tiny, tiny_run, tmp_path, capsys):
     [
         (lambda text: text[: len(text) // 2], "not JSON"),
         (lambda text: "[]", "not a JSON object"),
-        (lambda text: "{}", "'robot'"),
+        (lambda text: "{}", "of format None"),
         (lambda text: text.replace('"point"', '"bob"'), "no robot named 'bob'"),
         (lambda text: text.replace('"layers"', '"lawyers"'), "another version"),
     ],

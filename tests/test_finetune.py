@@ -197,11 +197,6 @@ def test_without_compilation(push):
     assert jnp.isfinite(action.target).all()
 
 
-def test_an_unknown_way_to_keep_lists_the_known(push):
-    with pytest.raises(UserError, match="'framed'; ways: separate, joined, relabelled"):
-        recoveries(Blind(push()), push, keep="framed")
-
-
 def test_a_fall_is_paid_until_the_horizon(toy_data):
     """So that the return of a robot that soon fell is as bad as that of one that stood there for as long."""
     data = toy_data([5, 5], steps=8)

@@ -22,6 +22,7 @@ from ct_jax import trajectories as storage
 from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
+from ct_jax.mazes import evaluated
 from ct_jax.model import load_model
 from ct_jax.presets import Settings
 from ct_jax.progress import Bar, Metrics
@@ -288,6 +289,76 @@ def test_a_damaged_file_is_named_with_the_mend(name, tiny, tiny_run, tmp_path, c
     line = err.splitlines()[-1]
     assert line.startswith("error: ") and err.count("error") == 1 and "Traceback" not in err
     assert str(folder / name) in line and f"delete {folder / Path(name).parent}" in line and "--resume" in line
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"start": None}, {"start": 3}, {"start": {"a": 1}}, {"start": [["x", 2]]}, {"start": [["nan", 2]]},
+        {"start": [[1e300, 2]]}, {"start": [[10**400, 2]]}, {"start": [[1, 2], [1]]}, {"goal": [[1, 2, 3]]},
+        {"shortest_m": [1, 2]}, {"shortest_m": 1}, {"start": [], "goal": [], "shortest_m": []},
+    ],
+    ids=lambda changes: str(changes)[:30],
+)  # fmt: skip
+def test_pairs_that_are_none_are_named(changes, tmp_path, tiny_settings):
+    run = make_run(tmp_path, tiny_settings)
+    (tmp_path / "evaluate").mkdir()
+    pairs = {"start": [[1, 2]], "goal": [[1, 2]], "shortest_m": [1]} | changes
+    (tmp_path / "evaluate" / "pairs-antmaze-umaze-4-0.json").write_text(json.dumps(pairs))
+    with pytest.raises(UserError, match=r"pairs-antmaze-umaze-4-0\.json: not an evaluation's pairs .*; delete it"):
+        evaluated(run, None, tmp_path / "evaluate", "antmaze-umaze", run.mazes["antmaze-umaze"], "ct", policy=None)
+
+
+@pytest.mark.parametrize(
+    "name", ["method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "steps_mean"]
+)
+@pytest.mark.parametrize("value", [None, [], {}, "x" * 3, [1], True])
+def test_rows_that_are_none_are_named(name, value, tiny_run, tmp_path, tiny_settings):
+    """A row left by an interrupted evaluation, and those of a finished one."""
+    rows = pipeline.results(tiny_run.folder)
+    row = rows[0] | {name: value}
+    if value is None:
+        del row[name]
+    elif isinstance(value, str) and name in ("method", "maze"):
+        return
+    run, folder = make_run(tmp_path, tiny_settings), tmp_path / "evaluate"
+    folder.mkdir()
+    (folder / "antmaze-umaze-ct.json").write_text(json.dumps(row))
+    with pytest.raises(UserError, match=r"antmaze-umaze-ct\.json: not a row"):
+        evaluated(run, None, folder, "antmaze-umaze", run.mazes["antmaze-umaze"], "ct", policy=None)
+    for found in ({"rows": [*rows, row]}, {"rows": row}, {"rows": None}, {}):
+        (folder / "results.json").write_text(json.dumps(found))
+        with pytest.raises(UserError, match=r"results\.json: not the rows of a table; delete .*evaluate and continue"):
+            pipeline.results(tmp_path)
+
+
+@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "target": 3}, {"maze": 9}])
+def test_trajectories_of_another_run_are_refused(changes, toy_data, tiny_run, tiny_settings, tmp_path):
+    """Of another robot, or of mazes that this run has not."""
+    folder = copy(tiny_run, tmp_path)
+    data = toy_data([3, 4])
+    wider = {name: np.repeat(getattr(data, name)[..., :1], n, -1) for name, n in changes.items() if name != "maze"}
+    data = data.replace(maze=data.maze + np.int32(changes.get("maze", 0)), **wider)
+    storage.save(data, folder / "collect" / "trajectories.npz")
+    with pytest.raises(UserError, match=r"trajectories\.npz: trajectories of another run; delete .*collect"):
+        pipeline.planning_trajectories(make_run(folder, tiny_settings), None, None)
+
+
+def test_a_config_without_its_provenance_is_named(tiny_run, tmp_path, tiny_settings):
+    folder = copy(tiny_run, tmp_path)
+    config = read_json(folder / "config.json")
+    del config["commit"]
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"config\.json: 'commit' is missing; restore the file"):
+        _ = make_run(folder, tiny_settings).made
+
+
+def test_time_spent_that_is_no_number_is_named(tmp_path, tiny_settings):
+    run = make_run(tmp_path, tiny_settings)
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "fit" / "spent.json").write_text('{"wall_s": "long"}')
+    with pytest.raises(UserError, match=r"spent\.json: 'wall_s' is no number"), run.stage("fit"):
+        pass
 
 
 # ------------------------------------------------------------------------------------------------ the run's folder

@@ -6,8 +6,6 @@ from dataclasses import asdict, fields, is_dataclass, replace
 import pytest
 
 from ct_envs import UserError
-from ct_jax.collect import GUIDES
-from ct_jax.finetune import KEEP
 from ct_jax.fit import FitConfig
 from ct_jax.presets import _LATER, PRESETS, Settings, from_dict, get_preset, to_dict
 from ct_jax.transformer import ModelConfig
@@ -53,7 +51,6 @@ def test_an_unknown_preset_lists_the_known():
     [
         lambda d: d["fit"].update(momentum=0.9),
         lambda d: d.pop("model"),
-        lambda d: d.update(sac=None),
         lambda d: d.update(colour="red"),
         lambda d: d["value"].pop("fit"),
     ],
@@ -67,14 +64,10 @@ def test_settings_of_another_version_are_refused(break_it):
 
 @pytest.mark.parametrize("name", ALL)
 def test_settings_agree_with_themselves(name):
-    """Names exist, sizes divide, and schedules end after they began."""
+    """Schedules end after they began."""
     s = ALL[name]
-    assert s.collect.guide in GUIDES and s.collect.starts in ("vertices", "maze") and s.recover.keep in KEEP
-    assert s.model.width % s.model.heads == 0
-    assert s.collect.envs >= 1 and s.collect.reset_interval >= 1
     for fit in (s.fit, s.round_fit, s.value.fit):
         assert fit is None or 0 < fit.warmup <= fit.updates or name == "rounds"
-    assert 0 < s.value.top <= 1
     assert s.sac.warmup * s.sac.envs >= s.sac.batch or s.sac.warmup < s.sac.iterations
 
 

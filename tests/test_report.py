@@ -314,6 +314,30 @@ def test_a_row_may_lack_figures(make_run):
     assert sum(row.strip() == words.method_label("ct") for row in page.rows) == 2
 
 
+def test_a_number_too_large_is_no_figure(make_run):
+    run = make_run()
+    rows = [make_row(SEEN, "ct", 0.5) | {"return_mean": 10**400, "steps_mean": 10**400}]
+    (run / "evaluate" / "results.json").write_text(json.dumps({"rows": rows}))
+    assert_whole(to_html(reading.read_run(run)))
+
+
+@pytest.mark.parametrize("kind", ["U3", "c16", "f4"])
+def test_arrays_of_another_kind_or_shape_are_none(make_run, kind):
+    """Of the roadmap and of episodes, one after the other."""
+    run = make_run()
+    points, edges = np.zeros((3, 2)), np.array([[0, 1], [1, 2]])
+    for name, changed in (("points", points.astype(kind)), ("edges", edges.astype(kind)), ("edges", np.arange(3))):
+        write_arrays(run / "prm" / "roadmap.npz", **{"points": points, "edges": edges, name: changed})
+        assert (reading.read_run(run).roadmap is None) == (name == "edges" or kind != "f4")
+    whole = make_episodes(0, failures=6)
+    for name in ("path", "success", "steps", "start", "goal", "collided", "returns"):
+        if name in whole:
+            write_arrays(run / "evaluate" / f"{UNSEEN}-ct.npz", **whole | {name: whole[name].astype(kind)})
+            assert_whole(to_html(reading.read_run(run)))
+    write_arrays(run / "evaluate" / f"{UNSEEN}-ct.npz", **whole | {"steps": whole["steps"] * np.nan})
+    assert_whole(to_html(reading.read_run(run)))
+
+
 def test_broken_episodes_are_drawn_as_far_as_they_go(make_run):
     run = make_run()
     arrays = make_episodes(0, failures=6)

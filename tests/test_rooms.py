@@ -173,7 +173,7 @@ def test_grades_count_as_the_paper_does():
     success, frontal, grazing = (np.array(x, bool) for x in ([1, 1, 1, 0, 0], [0, 0, 1, 0, 1], [0, 1, 1, 0, 0]))
     none = np.zeros(5)
     episodes = Episodes(
-        success, frontal | grazing, none, none, none, none, none, none, None, 0.0, frontal=frontal, grazing=grazing
+        success, frontal | grazing, none, none, none, none, none, none, None, 0.0, 400, frontal=frontal, grazing=grazing
     )
     assert grades(episodes) == {"full": 1, "partial": 1, "failed": 3}
 
@@ -228,11 +228,6 @@ def test_relabelled_steps_are_all_told_what_the_planner_would_do(recoveries):
         assert np.abs(data.target[i, :length] - data.action[i, :length]).max() > 0.05
 
 
-def test_a_keep_that_means_nothing_is_one_line(recoveries):
-    with pytest.raises(UserError, match="kept 'somehow'"):
-        recoveries(keep="somehow")
-
-
 def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
     driven = []
 
@@ -242,7 +237,7 @@ def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
             raise KeyboardInterrupt
         return toy_data([3, 5], seed=first), np.array([True, False])
 
-    keep = keeping(tmp_path / "waves", mend="begin anew")(wave)
+    keep = keeping(tmp_path / "waves", kinds=1, mend="begin anew")(wave)
     one, won = keep(0)
     with pytest.raises(KeyboardInterrupt):
         keep(50)
@@ -255,6 +250,10 @@ def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
     (tmp_path / "waves" / "0.npz").write_bytes(b"half")
     with pytest.raises(UserError, match=r"0\.npz.*begin anew"):
         keep(0)
+    for flags in ("{}", '{"flags": 3}', '{"flags": [[true]]}', '{"flags": [[1, 0]]}', '{"flags": [[true, true]] }\n]'):
+        (tmp_path / "waves" / "50.json").write_text(flags)
+        with pytest.raises(UserError, match=r"50\.json.*begin anew"):
+            keep(50)
 
 
 def test_courses_are_there_for_every_robot():

@@ -311,8 +311,6 @@ def test_it_learns_to_walk(roadmap):
 def test_a_heading_is_asked_of_a_robot_that_has_one():
     with pytest.raises(UserError, match="'point' has no heading"):
         make(replace(TINY, frame="heading"))
-    with pytest.raises(UserError, match="no frame named 'body'; frames: world, heading"):
-        make(replace(TINY, frame="body"))
 
 
 def test_the_ants_controller_does_not_see_the_world_turn():
@@ -370,8 +368,8 @@ def test_through_an_arrival_the_value_goes_on():
     assert 0.15 < changed.mean() < 0.45 and not changed[np.asarray(fall + arrived) > 0].any()
     away = np.linalg.norm(told.next_observation[changed, -2:], axis=-1)
     assert away.min() >= POINT.goal_tolerance_m and (np.asarray(told.reward)[changed] > 9).any()  # the bonus of some
-    with pytest.raises(UserError, match="set chain=True"):
-        make(replace(config, chain=False))
+    with pytest.raises(UserError, match="set chain"):
+        replace(config, chain=False)
 
 
 def test_a_fall_costs_more_and_more():

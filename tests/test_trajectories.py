@@ -251,6 +251,66 @@ def test_a_damaged_file_is_named(toy_data, tmp_path, damage):
         load(file)
 
 
+def damaged(arrays, draw):
+    """Arrays of trajectories with one of them changed into what it may not be."""
+    name = draw(st.sampled_from(sorted(arrays)))
+    array = arrays[name]
+    match draw(st.sampled_from(["missing", "type", "axis", "cut", "value"])):
+        case "missing":
+            return {other: arrays[other] for other in arrays if other != name}
+        case "type":
+            kinds = [np.bool_, np.complex64, np.str_, np.float32 if array.dtype.kind in "iu" else np.int8]
+            return arrays | {name: array.astype(draw(st.sampled_from(kinds)))}
+        case "axis":
+            return arrays | {name: draw(st.sampled_from([array[None], array[..., None], array[0]]))}
+        case "cut":
+            return arrays | {name: array[:-1], draw(st.sampled_from(["more", ""])): array}
+        case _:
+            name = draw(st.sampled_from([name for name in sorted(arrays) if name not in ("map_bits",)]))
+            bad = [-1, 10**6] if name == "length" else [-1] if name == "maze" else [np.nan, np.inf]
+            changed = arrays[name].copy()
+            changed[(0,) * changed.ndim] = draw(st.sampled_from(bad))
+            return arrays | {name: changed}
+
+
+@given(data=st.data())
+@settings(max_examples=200, derandomize=True, database=None)
+def test_arrays_that_are_no_trajectories_are_named(toy_data, tmp_path_factory, data):
+    good = toy_data(LENGTHS)
+    if data.draw(st.booleans()):
+        maps = np.zeros((*good.reward.shape, 2, 25, 25), np.uint8)
+        good = good.replace(seen=good.proprio, map_bits=pack_maps(maps))
+    file = tmp_path_factory.getbasetemp() / "bad.npz"
+    np.savez(file, **damaged(fields(good), data.draw))
+    with pytest.raises(UserError, match=r"bad\.npz: not a trajectory file \(.*\); collect again"):
+        load(file)
+
+
+@given(st.data())
+@settings(max_examples=200, derandomize=True, database=None)
+def test_changed_bytes_of_a_file_are_refused_or_change_nothing(toy_data, tmp_path_factory, data):
+    good, file = toy_data([2, 3]), tmp_path_factory.getbasetemp() / "changed.npz"
+    save(good, file)
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file.write_bytes(content)
+    try:
+        found = load(file)
+    except UserError as bad:
+        assert "\n" not in str(bad)
+    else:
+        assert_same(found, good)
+
+
+def test_what_lies_beyond_a_trajectorys_end_means_nothing(toy_data, tmp_path):
+    good = toy_data([2, 5])
+    reward = good.reward.copy()
+    reward[0, 2:] = np.nan
+    save(good.replace(reward=reward), tmp_path / "data.npz")
+    assert_same(load(tmp_path / "data.npz"), good.replace(reward=reward))
+
+
 @pytest.mark.parametrize("steps", [(2, 40, 300), (64, 65, 2), (7, 7, 7)])
 def test_joining_keeps_everything(toy_data, steps):
     """Whatever the padding of the parts: it may be cut, but no step is."""

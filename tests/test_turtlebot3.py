@@ -461,9 +461,9 @@ def test_without_pybullet_there_is_one_line(monkeypatch, make):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("wrong", [{"physics_dt_s": 0.0}, {"physics_dt_s": 1.0}])
+@pytest.mark.parametrize("wrong", [{"physics_dt_s": 0.0}, {"physics_dt_s": 1.0}, {"horizon": 0}, {"urdf": 3}])
 def test_a_wrong_setting_is_one_line(wrong):
-    with pytest.raises(UserError, match="physics_dt_s"):
+    with pytest.raises(UserError, match=next(iter(wrong))):
         Turtlebot3Config(**wrong)
 
 
@@ -751,8 +751,6 @@ def test_rooms_and_guides():
     np.testing.assert_array_equal(one.roadmap.points, again.roadmap.points)
     assert dense.world.covered() > one.world.covered()
     np.testing.assert_array_equal(clutter(5, 1.0).boxes, random_world(5).boxes)
-    with pytest.raises(UserError, match="guides: roadmap, shortcut, explorer"):
-        make_guide("luck", PRM)
 
 
 def test_rooms_of_many_densities():
@@ -909,5 +907,5 @@ def test_what_a_policy_is_told_has_nothing_of_the_truth():
 
 @pytest.mark.parametrize("level", [-0.1, 9.0, float("nan")])
 def test_a_noise_level_out_of_range_is_one_line(level):
-    with pytest.raises(UserError, match="noise level"):
+    with pytest.raises(UserError, match=r"noise is .*; give a number from 0 to 2"):
         Turtlebot3Config(noise=level)

@@ -14,7 +14,7 @@ maze; the ant walked to no goal with any.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ct_envs import Robot
-from ct_envs.frames import symmetries
+from ct_envs.checked import Above, Checked, Count, Share, Within
+from ct_envs.frames import FrameName, symmetries
 from ct_envs.maze import Maze
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
 from ct_jax.checkpoint import Checkpoints, run_to
@@ -32,24 +33,30 @@ from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
 
 
 @dataclass(frozen=True)
-class CqlConfig:
+class CqlConfig(Checked):
     """Conservative Q-learning."""
 
-    updates: int = 20_000
-    batch: int = 256  # steps of trajectories
-    learning_rate: float = 3e-4  # of policy, critics and temperature
-    width: int = 128  # of all layers
-    discount: float = 0.99
-    reward_scale: float = 0.1  # of the reward [m] in the critics' units
-    alpha: float = 5.0  # weight of the conservative penalty against the squared error
-    samples: int = 10  # actions of each kind (uniform, the policy's now, the policy's next) behind the penalty
-    target_rate: float = 0.05  # share of the new critics in the target critics at each update
-    temperature: float = 1.0  # weight of the policy's entropy, at first; 0: no entropy term
-    entropy: float = -1.0  # entropy for each action [nats] towards which the temperature is adapted
+    updates: Count = 20_000
+    batch: Annotated[int, Within(1, 1_000_000)] = 256  # steps of trajectories
+    learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # of policy, critics and temperature
+    width: Annotated[int, Within(1, 16_384)] = 128  # of all layers
+    discount: Share = 0.99
+    reward_scale: Annotated[float, Above(0, 1_000_000)] = 0.1  # of the reward [m] in the critics' units
+    alpha: Annotated[float, Within(0, 1_000_000)] = 5.0  # weight of the conservative penalty against the squared error
+    samples: Annotated[int, Within(1, 10_000)] = (
+        10  # actions of each kind (uniform, the policy's now, the policy's next)
+    )
+    # behind the penalty
+    target_rate: Annotated[float, Above(0, 1)] = 0.05  # share of the new critics in the target critics at each update
+    temperature: Annotated[float, Within(0, 1000)] = 1.0  # weight of the policy's entropy, at first; 0: no entropy term
+    entropy: Annotated[
+        float, Within(-1000, 1000)
+    ] = -1.0  # entropy for each action [nats] towards which the temperature is adapted
     soft_target: bool = False  # count the entropy in the targets, too
-    imitation: int = 0  # first updates in which the policy imitates the data, while the critics find their feet
+    imitation: Annotated[int, Within(0, 10**9)] = 0  # first updates in which the policy imitates the data, while the
+    # critics find their feet
     mirror: bool = False  # turn and reflect steps by a random symmetry of the robot
-    frame: str = "world"  # with "heading" the body is felt, and moved, in the robot's own frame
+    frame: FrameName = "world"  # with "heading" the body is felt, and moved, in the robot's own frame
 
 
 @struct.dataclass

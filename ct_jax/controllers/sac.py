@@ -8,7 +8,7 @@ a wall.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,57 +24,71 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
-from ct_envs.frames import own_frame, symmetries, transform, turn
+from ct_envs.checked import Above, Checked, Count, Share, Within
+from ct_envs.frames import FrameName, own_frame, symmetries, transform, turn
 from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
 from ct_jax.rollout import Action, Controller, act_as_meant, rollout
 
+Metres = Annotated[float, Within(0, 1_000_000)]  # and other prices of a step
+
 
 @dataclass(frozen=True)
-class SacConfig:
+class SacConfig(Checked):
     """Soft Actor-Critic (paper, sec. III-F, where it says; otherwise the usual values)."""
 
-    envs: int = 64  # environments stepped together
-    iterations: int = 500  # each: one step of all environments, then the updates
-    updates: int = 8  # gradient updates an iteration
-    warmup: int = 20  # first iterations, with random actions and no updates
-    batch: int = 256  # paper
-    learning_rate: float = 3e-4  # paper
-    final_rate: float = 1.0  # share of the learning rate that is left at the end; it falls linearly
-    average: float = 0.0  # decay, an update, of the mean of past policies that the controller is; 0: the last one
+    envs: Annotated[int, Within(1, 100_000)] = 64  # environments stepped together
+    iterations: Count = 500  # each: one step of all environments, then the updates
+    updates: Annotated[int, Within(1, 10_000)] = 8  # gradient updates an iteration
+    warmup: Annotated[int, Within(0, 10**9)] = 20  # first iterations, with random actions and no updates
+    batch: Annotated[int, Within(1, 1_000_000)] = 256  # paper
+    learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # paper
+    final_rate: Share = 1.0  # share of the learning rate that is left at the end; it falls linearly
+    average: Share = 0.0  # decay, an update, of the mean of past policies that the controller is; 0: the last one
     critic_norm: bool = False  # layer norm in the critics
-    hidden: tuple[int, ...] = (256, 256)  # paper, for point and ant
-    discount: float = 0.97
-    initial_temperature: float = 0.1
-    arrival_bonus: float = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
-    fall_m: tuple[float, float] = (5.0, 20.0)  # a fall costs what lying for ever this much farther off would [m]: at
+    hidden: Annotated[tuple[Annotated[int, Within(1, 16_384)], ...], Within(1, 16)] = (256, 256)  # paper
+    discount: Share = 0.97
+    initial_temperature: Annotated[float, Above(0, 1000)] = 0.1
+    arrival_bonus: Metres = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
+    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # a fall costs what lying for ever this much farther off would [m]: at
     # first, while each attempt to walk ends in one, and later; with 60 m the ant rather stood still
-    fall_ramp: tuple[float, float] = (0.2, 0.5)  # from where to where in the training it grows
-    alive_bonus: float = 0.0  # reward of each step on its feet (paper, for the humanoid), the only price of a fall then
-    speed_mps: float | None = None  # of a velocity reward: being faster than this towards the goal earns no more
-    action_cost: float = 0.0  # price of a step with all actuators at their limits
-    tilt_m: float = 0.0  # a torso lying on its side is paid like being this much farther off [m]
-    effort: float = 1.0  # share of the actuators' range that the controller uses
-    greedy: float = 0.0  # share of the environments in which it acts without chance, as it will later: else it never
+    fall_ramp: tuple[Share, Share] = (0.2, 0.5)  # from where to where in the training it grows
+    alive_bonus: Metres = 0.0  # reward of each step on its feet (paper, for the humanoid), the only price of a fall
+    # then
+    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # of a velocity reward: being faster than this towards
+    # the goal earns no more
+    action_cost: Metres = 0.0  # price of a step with all actuators at their limits
+    tilt_m: Metres = 0.0  # a torso lying on its side is paid like being this much farther off [m]
+    effort: Annotated[float, Above(0, 1)] = 1.0  # share of the actuators' range that the controller uses
+    greedy: Share = 0.0  # share of the environments in which it acts without chance, as it will later: else it never
     # meets the places where only chance moved it on
-    target_rate: float = 0.005  # share of the new critic in the target critic at each update
-    replay: int = 200_000  # transitions kept
-    turn_ramp: tuple[float, float] | None = None  # from where to where in the training robots begin to look anywhere;
+    target_rate: Annotated[float, Above(0, 1)] = 0.005  # share of the new critic in the target critic at each update
+    replay: Count = 200_000  # transitions kept
+    turn_ramp: tuple[Share, Share] | None = None  # from where to where in the training robots begin to look anywhere;
     # before, at the goal; without it, always anywhere
-    episode_steps: int = 60  # control steps to walk an edge
-    reset_velocity_mps: float = 2.0  # spread of the speed at an edge's start: a plan arrives there moving
-    held_out: float = 0.1  # share of the edges kept for the final test
-    frame: str = "world"  # of what the networks see: the "world"'s, or the robot's own "heading"
+    episode_steps: Annotated[int, Within(1, 1_000_000)] = 60  # control steps to walk an edge
+    reset_velocity_mps: Annotated[float, Within(0, 100)] = 2.0  # spread of the speed at an edge's start: a plan arrives
+    # there moving
+    held_out: Annotated[float, Within(0, 0.9)] = 0.1  # share of the edges kept for the final test
+    frame: FrameName = "world"  # of what the networks see: the "world"'s, or the robot's own "heading"
     mirror: bool = False  # replay each transition as one of the robot's symmetries would have it
-    relabel: float = (
-        0.0  # share of the replayed steps that are given a goal drawn around the robot: plans turn anywhere
-    )
-    relabel_m: float = 10.0  # how far off those goals are, at most [m]
+    relabel: Share = 0.0  # of the replayed steps are given a goal drawn around the robot: plans turn anywhere
+    relabel_m: Annotated[float, Above(0, 10_000)] = 10.0  # how far off those goals are, at most [m]
     chain: bool = False  # after a success go on from there along a next edge, as a plan does
     through: bool = False  # with ``chain``: an arrival ends nothing, what comes on the next edge counts as well
-    reward_scale: float = 1.0  # of the reward in the losses
+    reward_scale: Annotated[float, Above(0, 1_000_000)] = 1.0  # of the reward in the losses
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, ramp in (("fall_ramp", self.fall_ramp), ("turn_ramp", self.turn_ramp)):
+            if ramp is not None and ramp[0] > ramp[1]:
+                raise UserError(f"SacConfig.{name} is {ramp}; give first where it begins, then where it ends")
+        if self.through and not self.chain:
+            raise UserError("SacConfig.through is for chained edges, along which it learns through arrivals: set chain")
+        if self.replay < self.envs:
+            raise UserError(f"SacConfig.replay is {self.replay}; give at least a step of each of envs, {self.envs}")
 
 
 @struct.dataclass
@@ -96,7 +110,6 @@ class SacState:
     iteration: jax.Array
 
 
-FRAMES = ("world", "heading")
 TESTS = 20  # of the controller as it would be by then, on held-out edges, in the course of its training
 
 
@@ -223,12 +236,8 @@ class Sac:
         Args:
             env: with auto-reset and without maps; its robot says which reward is used.
         """
-        if config.frame not in FRAMES:
-            raise UserError(f"no frame named '{config.frame}'; frames: {', '.join(FRAMES)}")
         if config.frame == "heading" and not env.robot.has_heading:
             raise UserError(f"robot '{env.robot.name}' has no heading; use frame='world'")
-        if config.through and not config.chain:
-            raise UserError("a controller learns through arrivals only along chained edges: set chain=True")
         self.env, self.config = env, config
         self._symmetries = symmetries(env.robot) if config.mirror else None
         self._input_size = input_size(env.proprio_size, config.frame)

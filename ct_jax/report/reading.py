@@ -1,8 +1,8 @@
 """Reading a run folder: what is there, as arrays and plain values; what is missing or torn, as nothing."""
 
 import json
-import math
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
@@ -104,7 +104,7 @@ def read_run(folder: Path) -> Run:
 
 def number(value: Any) -> float | None:
     """A finite number, or nothing."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
         return float(value)
     return None
 
@@ -177,9 +177,10 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         # opened here, for NumPy leaves the file of a torn archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            found = {name: archive[name] for name in archive.files}
     except Exception:  # a torn archive fails in a dozen ways, all of which mean the same here
         return {}
+    return {name: array for name, array in found.items() if array.dtype.kind in "biuf"}
 
 
 def _read_roadmap(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -187,7 +188,9 @@ def _read_roadmap(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     points, edges = arrays.get("points"), arrays.get("edges")
     if points is None or edges is None or points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
         return None
-    edges = edges.reshape(-1, 2).astype(int)
+    if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu":
+        return None
+    edges = edges.astype(int)
     inside = len(edges) == 0 or (edges.min() >= 0 and edges.max() < len(points))
     return (points, edges) if inside else None
 
@@ -202,6 +205,8 @@ def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, boo
         n = path.shape[1]
         wanted = {"success": (n,), "steps": (n,), "start": (n, 2), "goal": (n, 2)}
         if any(name not in arrays or arrays[name].shape != shape for name, shape in wanted.items()):
+            continue
+        if not np.isfinite(arrays["steps"]).all():
             continue
         collided = arrays.get("collided")
         yield Episodes(

@@ -7,7 +7,7 @@ from several sides has further ones, that leave the world as it is.
 
 import functools
 import itertools
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 
 from ct_envs.errors import UserError
 from ct_envs.robots import Robot
+
+FrameName = Literal["world", "heading"]  # whose frame: the world's, or the robot's own
 
 
 class Symmetries(NamedTuple):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from importlib import resources
 
+from ct_envs.checked import shown
 from ct_envs.errors import UserError
 
 
@@ -96,7 +97,7 @@ def get_robot(name: str, course: str | None = None) -> Robot:
     known = [robot.name for robot in ROBOTS.values() if course in (None, robot.course)]
     if name not in known:
         where = f" for a {course}" if course else ""
-        raise UserError(f"no robot named '{name}'{where}; robots: {', '.join(known)}")
+        raise UserError(f"no robot named {shown(name)}{where}; robots: {', '.join(known)}")
     return ROBOTS[name]
 
 

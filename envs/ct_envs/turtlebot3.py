@@ -19,11 +19,12 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.lidar import LIDAR_BEAMS, LIDAR_RANGE_M, lidar_map
 from ct_envs.robots import TURTLEBOT3
@@ -51,22 +52,23 @@ _RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
 
 
 @dataclass(frozen=True)
-class Turtlebot3Config:
+class Turtlebot3Config(Checked):
     """The simulation and the task."""
 
-    control_dt_s: float = TURTLEBOT3.control_dt_s  # between two actions
-    physics_dt_s: float = 1 / 240  # between two steps of PyBullet
-    horizon: int = TURTLEBOT3.horizon  # control steps of an episode
-    goal_tolerance_m: float = TURTLEBOT3.goal_tolerance_m
-    collision_penalty: float = 1.0  # taken off the reward of a step in which the robot touches something
+    control_dt_s: Annotated[float, Above(0, 10)] = TURTLEBOT3.control_dt_s  # between two actions
+    physics_dt_s: Annotated[float, Above(0, 10)] = 1 / 240  # between two steps of PyBullet
+    horizon: Annotated[int, Within(1, 1_000_000)] = TURTLEBOT3.horizon  # control steps of an episode
+    goal_tolerance_m: Annotated[float, Above(0, 100)] = TURTLEBOT3.goal_tolerance_m
+    collision_penalty: Annotated[float, Within(0, 1_000_000)] = 1.0  # taken off the reward of a step in which the robot
+    # touches something
     urdf: str | None = None  # a URDF file instead of ours
-    noise: float = 0.0  # level of what a real robot gets wrong, see ``turtlebot3_noise``; 1 is meant to be real
+    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of what a real robot gets wrong, see
+    # ``turtlebot3_noise``; 1 is meant to be real
 
-    def __post_init__(self):
-        if not 0 < self.physics_dt_s <= self.control_dt_s:
-            raise UserError(f"physics_dt_s is {self.physics_dt_s}; use more than 0 and at most control_dt_s")
-        if not 0 <= self.noise <= MAX_NOISE:
-            raise UserError(f"noise level {self.noise}; use 0 to {MAX_NOISE}, 1 is that of a real robot")
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.physics_dt_s > self.control_dt_s:
+            raise UserError(f"Turtlebot3Config.physics_dt_s is {self.physics_dt_s}; give at most control_dt_s")
 
     @property
     def substeps(self) -> int:

@@ -1,0 +1,375 @@
+"""What a folder of a model says is not believed: 2,000 mutations of descriptions and weights, none of which gives a
+traceback, is taken out of its range, or changes what a model does.
+"""
+
+import copy
+import json
+import struct
+from dataclasses import is_dataclass
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import save_file
+
+from ct_envs import UserError
+from ct_jax.checkpoint import _sum_of_arrays, load_weights, save_weights
+from ct_jax.controllers.sac import SacConfig
+from ct_jax.fit import ValueConfig
+from ct_jax.model import (
+    TrainedModel,
+    blank_model,
+    load_controller,
+    load_model,
+    model_folder,
+    save_controller,
+    save_model,
+    zoo_names,
+)
+from ct_jax.presets import Settings, from_dict, to_dict
+from ct_jax.transformer import ModelConfig
+
+pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
+
+SETTINGS = Settings(
+    model=ModelConfig(layers=1, heads=2, width=8, context=3, context_acting=3, max_timestep=16),
+    value=ValueConfig(width=8),
+    sac=SacConfig(hidden=(8, 4)),
+)
+
+
+def examples(n):
+    """So many of them, the same in every run."""
+    return settings(
+        max_examples=n, derandomize=True, database=None,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )  # fmt: skip
+
+
+# Nothing that a setting may be, and much that only some may be.
+NASTY = [
+    None, True, False, -5, -1, 0, 1, 2, 3, 4, 99, 10**9, 2**31, 2**64, 10**400, 0.0, 0.5, 1.0, 2.0, 3.0, -0.5, 1e300,
+    float("nan"), float("inf"), "", "1", "3", "x", "ab", "world", "heading", "sideways", "own", "point", "ant", "a\nb",
+    "\x00", "x" * 10_000, [], [0], [1, 2], ["a"], [[[[[]]]]], {}, {"a": 1}, {"layers": 1},
+]  # fmt: skip
+
+
+def places(value, path=()):
+    """Paths to everything in a JSON value but itself."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in inside:
+        yield (*path, key)
+        yield from places(part, (*path, key))
+
+
+def at(value, path):
+    for key in path:
+        value = value[key]
+    return value
+
+
+@st.composite
+def mutated(draw, value):
+    """A JSON object with one to three things in it replaced, left out, added, moved or wrapped."""
+    value = copy.deepcopy(value)
+    for _ in range(draw(st.integers(1, 3))):
+        found = list(places(value))
+        if not found:
+            break
+        *parents, last = draw(st.sampled_from(found))
+        parent = at(value, parents)
+        match draw(st.sampled_from(["replace", "replace", "replace", "leave out", "add", "move", "wrap"])):
+            case "replace":
+                parent[last] = draw(st.sampled_from(NASTY))
+            case "leave out":
+                del parent[last]
+            case "add":
+                objects = [value, *(part for path in found if isinstance(part := at(value, path), dict))]
+                name = draw(st.sampled_from(["colour", "layers", "heads", "rooms", "", "a" * 500]))
+                draw(st.sampled_from(objects))[name] = draw(st.sampled_from(NASTY))
+            case "move":
+                parent[last] = copy.deepcopy(at(value, draw(st.sampled_from(found))))
+            case "wrap":
+                parent[last] = draw(st.sampled_from([[parent[last]], {"a": parent[last]}]))
+    return value
+
+
+def refused(load) -> bool:
+    """Whether something is refused as it should be: with a UserError of one line."""
+    try:
+        load()
+    except UserError as bad:
+        assert "\n" not in str(bad) and len(str(bad)) < 1000
+        return True
+    return False
+
+
+# ---------------------------------------------------------------------------------------------------- settings
+
+
+def leaves(value):
+    """The settings of a config that are no configs."""
+    if is_dataclass(value):
+        return [leaf for name in value.__dataclass_fields__ for leaf in leaves(getattr(value, name))]
+    return [part for entry in value for part in leaves(entry)] if isinstance(value, tuple) else [value]
+
+
+@given(mutated(json.loads(json.dumps(to_dict(SETTINGS)))))
+@examples(500)
+def test_settings_are_refused_or_sound(values):
+    """What is taken is finite and moderate, of the types of the defaults, and comes back as it is."""
+    found = []
+    if refused(lambda: found.append(from_dict(values))):
+        return
+    for leaf in leaves(found[0]):
+        assert leaf is None or isinstance(leaf, bool | str) or (-1e6 <= leaf <= 2**32)
+    assert from_dict(json.loads(json.dumps(to_dict(found[0])))) == found[0]
+    model = found[0].model
+    assert min(model.layers, model.heads, model.context_acting, model.modes, model.stride) >= 1 < model.width + 1
+    assert model.width % model.heads == 0 and model.map_cell_m > 0 and found[0].optimism > 0
+    assert all(type(size) is int and size > 0 for size in found[0].sac.hidden)
+
+
+@given(
+    st.fixed_dictionaries(
+        {},
+        optional={
+            "layers": st.integers(0, 3), "heads": st.integers(0, 4), "width": st.integers(0, 9),
+            "modes": st.integers(0, 3), "frame": st.sampled_from(["world", "heading", "sideways"]),
+            "skill": st.booleans(), "actions": st.booleans(), "stride": st.integers(0, 2),
+            "directions": st.integers(0, 2),
+        },
+    ),
+    st.sampled_from(["point", "ant", "turtlebot3"]),
+)  # fmt: skip
+@examples(40)
+def test_what_is_taken_can_be_built(changes, robot):
+    values = to_dict(SETTINGS)
+    values["model"] |= changes
+    refused(lambda: blank_model(robot, from_dict(values)))
+
+
+# ------------------------------------------------------------------------------------------------------- folders
+
+
+@pytest.fixture(scope="module")
+def trained():
+    policy, controller = blank_model("point", SETTINGS)
+
+    def draw(tree):
+        rng = np.random.default_rng(0)
+        return jax.tree.map(lambda leaf: rng.uniform(0.1, 1.0, leaf.shape).astype(leaf.dtype), tree)
+
+    return TrainedModel("point", SETTINGS, draw(policy), draw(controller), {"command": "ct-jax train point"})
+
+
+@pytest.fixture(scope="module")
+def folder(trained, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    save_model(folder, trained)
+    save_controller(folder / "controller", "point", SETTINGS.sac, trained.controller, {"seed": 0})
+    return folder
+
+
+def assert_same_model(found, model):
+    assert (found.robot, found.settings) == (model.robot, model.settings)
+    jax.tree.map(np.testing.assert_array_equal, found.policy, model.policy)
+    jax.tree.map(np.testing.assert_array_equal, found.controller, model.controller)
+
+
+@pytest.fixture(scope="module")
+def model_json(folder):
+    return json.loads((folder / "model.json").read_text())
+
+
+@given(data=st.data())
+@examples(500)
+def test_a_changed_description_is_refused_or_means_the_same(folder, model_json, trained, data):
+    (folder / "model.json").write_text(json.dumps(data.draw(mutated(model_json))))
+    found = []
+    if not refused(lambda: found.append(load_model(str(folder)))):
+        assert_same_model(found[0], trained)
+
+
+@given(data=st.data())
+@examples(400)
+def test_a_changed_description_of_a_controller_is_refused_or_means_the_same(folder, trained, data):
+    place = folder / "controller"
+    save_controller(place, "point", SETTINGS.sac, trained.controller, {"seed": 0})
+    described = json.loads((place / "controller.json").read_text())
+    (place / "controller.json").write_text(json.dumps(data.draw(mutated(described))))
+    found = []
+    if not refused(lambda: found.append(load_controller(str(place), "point"))):
+        controller, config = found[0]
+        assert config == SETTINGS.sac
+        jax.tree.map(np.testing.assert_array_equal, controller, trained.controller)
+
+
+@given(
+    st.integers(0, 3000), st.sampled_from(["[" * 100_000, '{"a":' * 100_000, "9" * 5000, "NaN", "-Infinity", "1e999"])
+)
+@examples(60)
+def test_json_that_cannot_be_read_is_one_line(folder, trained, where, what):
+    save_model(folder, trained)
+    text = (folder / "model.json").read_text()
+    where = text.index(":", where % (len(text) - 10)) + 1
+    (folder / "model.json").write_text(text[:where] + what + "," + text[where:])
+    assert refused(lambda: load_model(str(folder)))
+
+
+@pytest.mark.parametrize("change", [{"heads": 1}, {"heads": 4}, {"stride": 2}, {"returns": False},
+                                    {"context_acting": 4}, {"map_cell_m": 0.4}, {"commitment": 1.0}])  # fmt: skip
+def test_another_function_of_the_same_weights_is_refused(folder, trained, model_json, change):
+    """Shapes do not tell these from what was saved."""
+    save_model(folder, trained)
+    settings = model_json["settings"]
+    for number in (1, 2):  # nor does it help to say that an earlier version wrote it
+        changed = model_json | {"format": number, "settings": settings | {"model": settings["model"] | change}}
+        (folder / "model.json").write_text(json.dumps(changed))
+        with pytest.raises(UserError, match=r"weights\.safetensors: weights of another model"):
+            load_model(str(folder))
+
+
+def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
+    """They bound weights to nothing, and said so by their format."""
+    save_model(folder, trained)
+    weights = folder / "weights.safetensors"
+    arrays = {"transformer": trained.policy.params, "value": trained.policy.value_params}
+    arrays |= {"normalizer": trained.controller.normalizer, "controller": trained.controller.policy}
+    save_weights(weights, arrays)
+    with pytest.raises(UserError, match="weights of another model"):
+        load_model(str(folder))
+    (folder / "model.json").write_text(json.dumps(model_json | {"format": 1}))
+    assert_same_model(load_model(str(folder)), trained)
+
+
+@pytest.mark.parametrize("number", [0, 3, 99, None, "2", 2.0, True])
+def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json, number):
+    save_model(folder, trained)
+    (folder / "model.json").write_text(json.dumps(model_json | {"format": number}))
+    with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 and 2"):
+        load_model(str(folder))
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_shipped_weights_are_bound_to_their_description(name, tmp_path):
+    place = model_folder("zoo:" + name)
+    for file in place.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    described = json.loads((tmp_path / "model.json").read_text())
+    described["settings"]["optimism"] *= 0.5
+    (tmp_path / "model.json").write_text(json.dumps(described))
+    with pytest.raises(UserError, match="weights of another model"):
+        load_model(str(tmp_path))
+
+
+# ------------------------------------------------------------------------------------------------------- weights
+
+TREE = {
+    "a": np.linspace(-1.0, 1.0, 6, dtype=np.float32).reshape(2, 3),
+    "b": {"c": np.arange(4, dtype=np.float32), "n": np.uint32([7])},
+}
+FLAT = {"a": TREE["a"], "b/c": TREE["b"]["c"], "b/n": TREE["b"]["n"]}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    file = tmp_path_factory.mktemp("weights") / "w.safetensors"
+    save_weights(file, TREE)
+    return file, file.read_bytes()
+
+
+@given(data=st.data())
+@examples(400)
+def test_changed_bytes_are_refused_or_change_nothing(weights, data):
+    file, whole = weights
+    parts = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 3))):
+        where = data.draw(st.integers(0, max(len(parts) - 1, 0)))
+        match data.draw(st.sampled_from(["flip", "set", "cut", "insert", "remove", "length"])):
+            case "flip" if parts:
+                parts[where] ^= 1 << data.draw(st.integers(0, 7))
+            case "set" if parts:
+                parts[where] = data.draw(st.sampled_from(b'\x00\xff "{}[]:,019-'))
+            case "cut":
+                del parts[where:]
+            case "insert":
+                parts[where:where] = data.draw(st.binary(max_size=9))
+            case "remove":
+                del parts[where : where + data.draw(st.integers(1, 9))]
+            case "length":
+                parts[:8] = struct.pack(
+                    "<Q", data.draw(st.sampled_from([0, 1, 2**31, 2**63, len(whole), len(whole) - 8]))
+                )
+    file.write_bytes(bytes(parts))
+    found = []
+    if not refused(lambda: found.append(load_weights(file, TREE))):
+        jax.tree.map(np.testing.assert_array_equal, found[0], TREE)
+
+
+TYPES = [np.float64, np.float16, np.int8, np.int32, np.bool_, np.uint32, np.complex64]
+
+
+@given(data=st.data())
+@examples(200)
+def test_wrong_arrays_are_refused_though_their_sum_is_right(weights, data):
+    """Of another type or shape, not finite, missing, or too many."""
+    file, _ = weights
+    arrays = dict(FLAT)
+    name = data.draw(st.sampled_from(sorted(arrays)))
+    match data.draw(st.sampled_from(["type", "shape", "value", "missing", "more", "sum"])):
+        case "type":
+            other = data.draw(st.sampled_from([kind for kind in TYPES if kind != arrays[name].dtype]))
+            arrays[name] = arrays[name].astype(other)
+        case "shape":
+            shapes = [arrays[name][None], arrays[name][..., None], arrays[name][:0], np.concatenate([arrays[name]] * 2)]
+            arrays[name] = data.draw(st.sampled_from(shapes))
+        case "value":
+            name = "a"
+            arrays[name] = arrays[name].copy()
+            where = data.draw(st.tuples(st.integers(0, 1), st.integers(0, 2)))
+            arrays[name][where] = data.draw(st.sampled_from([np.nan, np.inf, -np.inf]))
+        case "missing":
+            del arrays[name]
+        case "more":
+            arrays[data.draw(st.sampled_from(["d", "b/d", "a/b", ""]))] = np.zeros(1, np.float32)
+        case "sum":
+            save_file(arrays, file, metadata=data.draw(st.sampled_from([None, {}, {"sha256": ""}, {"sum": "x"}])))
+            assert refused(lambda: load_weights(file, TREE))
+            return
+    save_file(arrays, file, metadata={"sha256": _sum_of_arrays(arrays)})
+    assert refused(lambda: load_weights(file, TREE))
+
+
+def test_refused_weights_say_what_was_found_and_what_is_needed(weights):
+    file, _ = weights
+
+    def refusal(arrays, **metadata):
+        save_file(arrays, file, metadata={"sha256": _sum_of_arrays(arrays)} | metadata)
+        with pytest.raises(UserError, match=r"w\.safetensors: ") as caught:
+            load_weights(file, TREE)
+        return str(caught.value)
+
+    assert "'a' has type float64, this model needs float32" in refusal(FLAT | {"a": np.float64(TREE["a"])})
+    assert "'a' has type bool, this model needs float32" in refusal(FLAT | {"a": TREE["a"] > 0})
+    assert "'a' is not finite everywhere" in refusal(FLAT | {"a": np.full((2, 3), np.nan, np.float32)})
+    assert "holds weights 'd' besides" in refusal(FLAT | {"d": np.zeros(1)})
+    assert "not as it was written" in refusal(FLAT, sha256="0" * 64)
+    save_file(FLAT, file)
+    with pytest.raises(UserError, match="without its SHA-256 sum"):
+        load_weights(file, TREE)
+
+
+@pytest.mark.parametrize("kind", ["F8_E4M3", "F8_E8M0"])
+def test_types_that_numpy_has_not_are_refused(tmp_path, kind):
+    header = json.dumps({"a": {"dtype": kind, "shape": [2, 3], "data_offsets": [0, 6]}}).encode()
+    (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(6))
+    assert refused(lambda: load_weights(tmp_path / "w.safetensors", TREE))
+
+
+def test_a_training_that_diverged_says_so_instead_of_saving(tmp_path):
+    with pytest.raises(UserError, match="'a' has become infinite or NaN in training; try a lower learning rate"):
+        save_weights(tmp_path / "w.safetensors", {"a": np.float32([1.0, np.nan])})
+    assert not list(tmp_path.iterdir())
