@@ -72,12 +72,14 @@ def run_episodes(
     return state, memory, jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def start_episodes(env: MazeEnv, key: jax.Array, maze: Maze, start: jax.Array, goal: jax.Array) -> State:
-    """States of N episodes with the given mazes (leading axis N), starts and goals [N, 2] (m). The devices share them,
-    so there must be as many as ``fill_up`` says."""
+def start_episodes(env: MazeEnv, keys: jax.Array, maze: Maze, start: jax.Array, goal: jax.Array) -> State:
+    """States of N episodes with the given keys [N], mazes (leading axis N), starts and goals [N, 2] (m).
+
+    The devices share them, so there must be as many as ``fill_up`` says.
+    """
     n = len(start)
     tasks = Tasks(start[:, None], goal[:, None], jnp.ones(n, jnp.int32))
-    return _reset(env)(*place((jax.random.split(key, n), maze, tasks), sharded(data_mesh())))
+    return _reset(env)(*place((keys, maze, tasks), sharded(data_mesh())))
 
 
 _resets: dict[int, tuple[MazeEnv, Callable]] = {}
@@ -225,7 +227,7 @@ def draw_batch(
     start, goal = (jnp.asarray(ends.reshape(-1, 2)[order]) for ends in (start, goal))
     which = np.repeat(np.arange(n_maps), per_map)[order]
     maze = jax.tree.map(lambda leaf: leaf[maze_of_map[which]], mazes)
-    state = start_episodes(env, keys[-1], maze, start, goal)
+    state = start_episodes(env, jax.random.split(keys[-1], len(order)), maze, start, goal)
     return Batch(state, tables, jnp.asarray(which), maze_of_map[which], np.arange(len(order)) < config.envs)
 
 

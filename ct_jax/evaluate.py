@@ -168,9 +168,10 @@ def evaluate(
     begun = time.perf_counter()
     order = fill_up(len(pairs.start), data_mesh())
     n = len(order)
-    key = jax.random.key(pairs.seed)
+    keys = jax.random.split(jax.random.key(pairs.seed), len(pairs.start) + 2)
+    start_keys, plan_key, run_key = keys[:-2][order], keys[-2], keys[-1]
     mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
-    state = start_episodes(env, key, mazes, jnp.asarray(pairs.start[order]), jnp.asarray(pairs.goal[order]))
+    state = start_episodes(env, start_keys, mazes, jnp.asarray(pairs.start[order]), jnp.asarray(pairs.goal[order]))
     asked = not_joined = None
     if method not in GUIDED:
         assert policy is not None
@@ -180,10 +181,12 @@ def evaluate(
         assert controller is not None
         prm = prm or PrmConfig()
         guide = make_guide("shortcut" if method == "planner" else method, env, prm)
-        tables, not_joined = _plans(key, env, maze, pairs, prm) if method == "planner" else (None, None)
+        tables, not_joined = _plans(plan_key, env, maze, pairs, prm) if method == "planner" else (None, None)
         actor = Guided(controller, guide)
         memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
-    state, _, steps = run_episodes(env, actor, state, memory, key, chunk=50, limit=env.horizon, on_progress=on_progress)
+    state, _, steps = run_episodes(
+        env, actor, state, memory, run_key, chunk=50, limit=env.horizon, on_progress=on_progress
+    )
     episodes = _outcome(env, state, steps, pairs, time.perf_counter() - begun, asked)
     return replace(episodes, not_joined=not_joined)
 

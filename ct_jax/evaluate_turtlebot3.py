@@ -108,9 +108,13 @@ def evaluate_rooms(
     """
     begun = time.perf_counter()
     assert pairs.world is not None
-    key = jax.random.key(pairs.seed)
+    plan_key, act_key = jax.random.split(jax.random.key(pairs.seed))
     ends = np.stack([pairs.start, pairs.goal], 1)
-    rooms = [_room(key, world, ends[pairs.world == i]) for i, world in enumerate(worlds) if method in GUIDED]
+    rooms = [
+        _room(jax.random.fold_in(plan_key, i), world, ends[pairs.world == i])
+        for i, world in enumerate(worlds)
+        if method in GUIDED
+    ]
     not_joined = [int((~joins(room.roadmap, ends[pairs.world == i])).sum()) for i, room in enumerate(rooms)]
     drives: list[Drive] = []
     asked: list[np.ndarray] = []
@@ -123,7 +127,7 @@ def evaluate_rooms(
             drives += drive_guided(pool, wave, guide, controller)
         else:
             assert policy is not None
-            driver = PolicyDriver(policy, jax.random.fold_in(key, first))
+            driver = PolicyDriver(policy, jax.random.fold_in(act_key, first))
             begin = _telling(driver, asked, len(which))
             drives += drive(pool, episodes, driver, begin)
         if on_progress is not None:

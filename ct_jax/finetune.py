@@ -121,11 +121,14 @@ def recover(
         UserError: a ``keep`` that means nothing.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
-    first_maze = int(jax.random.randint(key, (), 0, len(mazes.cell_m)))  # where there are many, each round in others
+    maze_key, wave_key = jax.random.split(key)
+    first_maze = int(
+        jax.random.randint(maze_key, (), 0, len(mazes.cell_m))
+    )  # where there are many, each round in others
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
-        batch_key, run_key = jax.random.split(jax.random.fold_in(key, first))
+        batch_key, run_key = jax.random.split(jax.random.fold_in(wave_key, first))
         batch = draw_batch(
             batch_key, env, mazes, collecting, prm, first_maze=first_maze + first // collecting.reset_interval
         )

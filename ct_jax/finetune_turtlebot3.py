@@ -72,11 +72,12 @@ def recover(
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, prm)
     planner = GuidedDriver(guide, controller, collecting.noise)
+    draw_key, act_key = jax.random.split(key)
     supervised = Supervised(policy, Given(), config)  # pyright: ignore[reportArgumentType]
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
-        drawn = draw_wave(key, first, collecting, prm, n=collecting.envs, densities=densities)
-        driver = SupervisedDriver(supervised, planner, jax.random.fold_in(key, first))
+        drawn = draw_wave(draw_key, first, collecting, prm, n=collecting.envs, densities=densities)
+        driver = SupervisedDriver(supervised, planner, jax.random.fold_in(act_key, first))
 
         def begin(frame: Frame) -> tuple[Any, Any, int]:
             state = as_state(frame)

@@ -203,9 +203,10 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     value = ValueNetwork(settings.value.width)
 
     def build(key: jax.Array) -> TransformerPolicy:
+        transformer_key, value_key = jax.random.split(key)
         return TransformerPolicy(
-            params=transformer.init(key, maps, proprio, goal, *rest),
-            value_params=value.init(key, maps, proprio, goal),
+            params=transformer.init(transformer_key, maps, proprio, goal, *rest),
+            value_params=value.init(value_key, maps, proprio, goal),
             config=settings.model,
             action_size=action_size,
             value_width=settings.value.width,

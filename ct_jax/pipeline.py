@@ -158,7 +158,7 @@ def _fit_both(
     settings = run.settings
     last = number == settings.rounds
     suffix = f"-{number}" if number else ""
-    keys = jax.random.split(jax.random.fold_in(run.key(stage), number), 4)
+    keys = run.round_keys(stage, number)
     value, model = ValueNetwork(settings.value.width), policy.model
 
     def train_one(name: str, learner: Fit, params: Any, data: Trajectories, key: jax.Array) -> Any:
@@ -224,7 +224,7 @@ def _recoveries(run: Run, course: Course, number: int, policy: TransformerPolicy
         return _read_trajectories(run, file)
     with Bar(f"recover-{number}", run.settings.recover.recoveries) as bar:
         found = course.recover(
-            jax.random.fold_in(run.key("finetune"), number), policy, controller, file.parent / f"waves-{number}",
+            run.round_keys("finetune", number)[4], policy, controller, file.parent / f"waves-{number}",
             lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
         )  # fmt: skip
     storage.save(found, file)

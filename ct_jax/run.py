@@ -59,6 +59,10 @@ class Run:
         """The stage's own randomness."""
         return jax.random.fold_in(jax.random.key(self.seed), STAGES.index(stage))
 
+    def round_keys(self, stage: str, number: int) -> jax.Array:
+        """The keys of a round: to start and train the value network, likewise the transformer, and to recover."""
+        return jax.random.split(jax.random.fold_in(self.key(stage), number), 5)
+
     @property
     def spec(self) -> Robot:
         """The robot's data."""

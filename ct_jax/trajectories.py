@@ -240,12 +240,12 @@ def sample_windows(
         overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
         stride: from one step of a piece to the next.
     """
-    which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
+    which_key, where_key, mirror_key, shift_key, origin_key = jax.random.split(key, 5)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
     # Of a trajectory, the steps from one of the first few on by strides are one to draw from.
-    origin = jax.random.randint(jax.random.fold_in(where_key, 1), (batch,), 0, jnp.minimum(stride, length))
+    origin = jax.random.randint(origin_key, (batch,), 0, jnp.minimum(stride, length))
     count = (length - origin + stride - 1) // stride
     # Pieces may begin at any step that leaves them full, or at the start of a short trajectory. Those that would hang
     # over an end are moved inside: else first and last steps would be in one piece of many that hold a middle one.

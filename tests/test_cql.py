@@ -179,7 +179,9 @@ def test_a_policy_without_critics_imitates(careless, imitator, good):
 def test_the_better_action_is_imitated(careful, fork):
     policy = careful.policy(taught(careful, fork))
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=5)
-    state = start_episodes(env, jax.random.key(0), MAZES, jnp.array([[6.0, 6.0]]), jnp.array([[6.8, 6.0]]))
+    state = start_episodes(
+        env, jax.random.split(jax.random.key(0), 1), MAZES, jnp.array([[6.0, 6.0]]), jnp.array([[6.8, 6.0]])
+    )
     action, memory = policy.act(policy.init(state), state, jax.random.key(0))
     again, _ = policy.act(memory, state, jax.random.key(1))
     np.testing.assert_allclose(action.done[0], [0.7, 0.0], atol=0.3)

@@ -34,7 +34,7 @@ def policy():
 def start():
     mazes = stack_mazes([load_maze("antmaze-umaze")] * N)
     begin = jnp.array([[6.0, 6.0], [14.0, 6.0], [6.0, 14.0]])
-    return start_episodes(ENV, jax.random.key(0), mazes, begin, begin[::-1] + 0.7)
+    return start_episodes(ENV, jax.random.split(jax.random.key(0), len(begin)), mazes, begin, begin[::-1] + 0.7)
 
 
 @jax.jit

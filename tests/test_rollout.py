@@ -20,7 +20,7 @@ def start():
     mazes = stack_mazes([load_maze("antmaze-umaze")] * N)
     begin = jnp.tile(jnp.array([[6.0, 6.0]]), (N, 1))
     goal = jnp.array([[6.2, 6.0], [6.9, 6.0], [14.0, 6.0], [14.0, 14.0]])
-    return start_episodes(ENV, jax.random.key(0), mazes, begin, goal)
+    return start_episodes(ENV, jax.random.split(jax.random.key(0), len(begin)), mazes, begin, goal)
 
 
 @struct.dataclass

@@ -404,7 +404,7 @@ class Sac:
         Steps that ended an episode stay as they are: the goal after them is the next one's.
         """
         config, tolerance = self.config, self.env.robot.goal_tolerance_m
-        which_key, *goal_keys = jax.random.split(key, 3)
+        which_key, *goal_keys, next_key = jax.random.split(key, 4)
         shape = batch.reward.shape
         chosen = jax.random.bernoulli(which_key, config.relabel, shape) & (batch.discount > 0)
         goal = self._draw_goals(goal_keys, shape)
@@ -415,7 +415,7 @@ class Sac:
         reward = batch.reward - self._towards(length(old), length(old_after)) + config.arrival_bonus * arrived
         reward += self._towards(length(goal), length(after))
         if config.through:
-            next_goal = self._draw_goals(list(jax.random.split(jax.random.fold_in(key, 1))), shape)
+            next_goal = self._draw_goals(list(jax.random.split(next_key)), shape)
             after = jnp.where(arrived[:, None], next_goal, after)
 
         def put(seen: jax.Array, goals: jax.Array) -> jax.Array:
@@ -522,9 +522,10 @@ class Steered:
 def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
     """Share of the given edges that the controller walks in time, from rest. ``env`` must not reset by itself."""
     n = tasks.start.shape[0]
+    keys = jax.random.split(key, n + 1)
     one_each = Tasks(tasks.start[:, None], tasks.goal[:, None], jnp.ones(n, jnp.int32))
-    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, 0)))(jax.random.split(key, n), maze, one_each)
-    state, _, _ = rollout(env, Steered(act), state, (), key, env.horizon)
+    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, 0)))(keys[:n], maze, one_each)
+    state, _, _ = rollout(env, Steered(act), state, (), keys[n], env.horizon)
     return float(state.info["success"].mean())
 
 
@@ -535,10 +536,11 @@ def edges_in_a_row(
 
     ``env`` must reset by itself, and the tasks follow each other (``chain_tasks``).
     """
-    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, None)))(jax.random.split(key, walkers), maze, tasks)
+    keys = jax.random.split(key, walkers + edges)
+    state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, None)))(keys[:walkers], maze, tasks)
     walked, unbroken = np.zeros(walkers, int), np.ones(walkers, bool)
     for i in range(edges):  # as many steps as the slowest may take
-        state, _, steps = rollout(env, Steered(act), state, (), jax.random.fold_in(key, i), env.horizon)
+        state, _, steps = rollout(env, Steered(act), state, (), keys[walkers + i], env.horizon)
         ended = 1.0 - np.concatenate([np.asarray(steps.alive)[1:], 1.0 - np.asarray(state.done)[None]])
         won = np.asarray(steps.success) > 0
         whole = unbroken & (np.cumsum((ended > 0) & ~won, 0) == 0)
@@ -567,7 +569,7 @@ def train_controller(
     Returns:
         The controller; its success on held-out edges and on twenty of any edges in a row.
     """
-    train_key, test_key, split_key = jax.random.split(key, 3)
+    train_key, test_key, split_key, row_key = jax.random.split(key, 4)
     seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
     train_tasks, test_tasks = split_edges(roadmap, config.held_out, seed)
     if config.chain:
@@ -595,5 +597,5 @@ def train_controller(
     every_edge = chain_tasks(_tasks(roadmap, roadmap.edges), seed)
     return act, {
         "held_out_success": edge_success(alone, act, maze, test_tasks, test_key),
-        "twenty_in_a_row": edges_in_a_row(in_a_row, act, maze, every_edge, jax.random.fold_in(test_key, 0)),
+        "twenty_in_a_row": edges_in_a_row(in_a_row, act, maze, every_edge, row_key),
     }

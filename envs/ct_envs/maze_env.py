@@ -119,8 +119,9 @@ class MazeEnv(Env):
 
     def _begin(self, key: jax.Array, state: State) -> State:
         """The first state of an episode, in the maze and with the tasks of ``state``."""
-        task, start, goal = self._draw_task(key, state.info["maze"], state.info["tasks"])
-        physics = self._initial_physics(jax.random.fold_in(key, 1), start, goal, state.info["tasks"])
+        task_key, physics_key = jax.random.split(key)
+        task, start, goal = self._draw_task(task_key, state.info["maze"], state.info["tasks"])
+        physics = self._initial_physics(physics_key, start, goal, state.info["tasks"])
         info = state.info | {"task": task, "goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
         return self._observe(physics, state.replace(info=info))
 
@@ -210,10 +211,10 @@ class MazeEnv(Env):
         if not self.auto_reset:
             stepped = self._observe(physics, stepped)
             return jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), stepped, state)
-        key, now = jax.random.split(info["key"])
+        key, now, follow_key = jax.random.split(info["key"], 3)
         stepped = stepped.replace(info=info | {"key": key}, pipeline_state=physics)
         fresh = self._begin(now, stepped)  # only what differs is chosen below; the observation is made once
-        after, fresh = self._go_on(jax.random.fold_in(now, 2), stepped, fresh)
+        after, fresh = self._go_on(follow_key, stepped, fresh)
         names = ("task", "goal", "episode_steps")
         chosen = {name: jnp.where(done, fresh.info[name], stepped.info[name]) for name in names}
         physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), after, physics)
