@@ -1,4 +1,4 @@
-"""Acting with a Control Transformer: return bookkeeping and the key/value cache (paper, sec. III-C)."""
+"""Acting with a Control Transformer: return bookkeeping and what it keeps of the past (paper, sec. III-D)."""
 
 from typing import Any
 
@@ -10,15 +10,15 @@ from jaxtyping import Array, Float
 
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.rollout import Action, act_as_meant
-from ct_jax.transformer import Cache, ControlTransformer, ModelConfig, empty_cache
+from ct_jax.transformer import Cache, ControlTransformer, History, ModelConfig, empty_cache, empty_history
 from ct_jax.value import ValueNetwork
 
 
 @struct.dataclass
 class Conditioned:
-    """Memory of N episodes: the cache, and the return-to-go still asked for."""
+    """Memory of N episodes: what the transformer keeps of the past, and the return-to-go still asked for."""
 
-    cache: Cache
+    past: Cache | History
     rtg: Float[Array, "N"]
 
 
@@ -41,8 +41,12 @@ class TransformerPolicy:
 
     def init(self, state: State) -> Conditioned:
         """Ask for the return that the value network predicts from the first observation."""
-        n = state.done.shape[0]
-        return Conditioned(empty_cache(self.config, self.action_size, n), self._value(self, state))
+        n, obs = state.done.shape[0], state.obs
+        if self.config.acting == "window":
+            past = empty_history(self.config, obs["proprio"].shape[-1], self.action_size, n)  # pyright: ignore
+        else:
+            past = empty_cache(self.config, self.action_size, n)
+        return Conditioned(past, self._value(self, state))
 
     @staticmethod
     @jax.jit
@@ -58,7 +62,8 @@ class TransformerPolicy:
         rtg = memory.rtg - state.reward
         if self.reprompt:
             rtg = jnp.minimum(rtg, self._value(self, state))
-        action, cache = self.model.apply(
-            self.params, memory.cache, obs["map"], obs["proprio"], obs["goal"], rtg, method="act"
+        method = "act_on_window" if self.config.acting == "window" else "act"
+        action, past = self.model.apply(
+            self.params, memory.past, obs["map"], obs["proprio"], obs["goal"], rtg, method=method
         )  # pyright: ignore
-        return act_as_meant(action), Conditioned(cache, rtg)
+        return act_as_meant(action), Conditioned(past, rtg)

@@ -48,7 +48,7 @@ class Settings(Checked):
 
 
 PAPER = Settings(
-    model=ModelConfig(layers=4, heads=4, width=512, context=50, context_acting=200),
+    model=ModelConfig(layers=4, heads=4, width=512, context=50, context_acting=200, acting="window"),
     fit=FitConfig(
         updates=75_000, batch=64, steps=50, learning_rate=4e-4, weight_decay=1e-3, warmup=10_000, precision="bfloat16"
     ),
@@ -57,7 +57,7 @@ PAPER = Settings(
 
 PUBLISHED = replace(
     PAPER,
-    model=ModelConfig(layers=3, heads=4, width=128, context=32, context_acting=32),
+    model=ModelConfig(layers=3, heads=4, width=128, context=32, context_acting=32, acting="window"),
     fit=FitConfig(updates=2400, batch=64, steps=32, learning_rate=4e-4, weight_decay=1e-3, warmup=320),
     value=ValueConfig(fit=FitConfig(updates=2000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)),
 )
@@ -69,7 +69,7 @@ CPU = replace(
     PUBLISHED,
     prm=PrmConfig(margin_m=0.3),
     collect=CollectConfig(trajectories=1000, guide="explorer", starts="maze", noise=0.5),
-    model=replace(PUBLISHED.model, context=48, context_acting=48, dropout=0.0, actions=False),
+    model=replace(PUBLISHED.model, context=48, context_acting=48, acting="cache", dropout=0.0, actions=False),
     fit=replace(_LIFTED, updates=800),
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
     recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=250),
@@ -200,7 +200,9 @@ def with_fits(settings: Settings, **changes: Any) -> Settings:
 TURTLEBOT3_PAPER = Settings(
     prm=PrmConfig(samples=150, connect_m=2.0, most_samples=2400),
     collect=CollectConfig(trajectories=1000, reset_interval=25, envs=50, horizon=400),
-    model=ModelConfig(layers=4, heads=4, width=128, context=5, context_acting=5, map_cell_m=LIDAR_CELL_M),
+    model=ModelConfig(
+        layers=4, heads=4, width=128, context=5, context_acting=5, acting="window", map_cell_m=LIDAR_CELL_M
+    ),
     fit=FitConfig(updates=15_000, batch=128, steps=5, learning_rate=1e-4, weight_decay=1e-4, warmup=10_000),
     value=ValueConfig(fit=FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)),
     recover=RecoverConfig(recoveries=500, stuck_steps=25, stuck_m=0.15, bumps=2, patience=300),
@@ -219,7 +221,7 @@ TURTLEBOT3_CPU = replace(
     TURTLEBOT3_PAPER,
     prm=replace(TURTLEBOT3_PAPER.prm, margin_m=0.08),
     collect=replace(TURTLEBOT3_PAPER.collect, guide="explorer", starts="maze", noise=0.3),
-    model=replace(TURTLEBOT3_PAPER.model, context=25, context_acting=25, dropout=0.0, actions=False),
+    model=replace(TURTLEBOT3_PAPER.model, context=25, context_acting=25, acting="cache", dropout=0.0, actions=False),
     value=ValueConfig(fit=replace(TURTLEBOT3_PAPER.value.fit, mirror=True)),
     fit=replace(_TURTLEBOT3_LIFTED, updates=4000),
     recover=replace(TURTLEBOT3_PAPER.recover, recoveries=250, keep="relabelled", takeover=0.01),
@@ -278,6 +280,7 @@ def get_preset(name: str, robot: str = "point") -> Settings:
 # Settings that came later, with what was before them: left out where they say just that, so that a run of then goes on.
 _LATER = {
     "most_samples": 25_600,
+    "acting": "cache",
     "rooms": None,
     "random_mazes": 0,
     "controller_effort": 1.0,

@@ -1,9 +1,12 @@
 """Control Transformer: a return-conditioned causal transformer (paper, sec. III-C and E).
 
-The policy is defined as *banded* causal attention: a token of step t attends to tokens of steps t - K + 1 ... t that
-come before it. That is what acting with a key/value cache over a sliding window computes, and training uses the same
-mask, so a window of any number of steps may be trained on. With a ``stride`` of s it attends to steps t, t - s, t - 2s
-and so on, K of them: s times the memory at the cost of one.
+Attention is causal and *banded*: a token of step t attends to tokens of steps t - K + 1 ... t that come before it. With
+a ``stride`` of s it attends to steps t, t - s, t - 2s and so on, K of them: s times the memory at the cost of one.
+
+There are two ways to act. With ``acting="window"``, the paper's, each action is computed anew from the last K steps:
+this is what training on pieces of K steps computes. With ``acting="cache"`` keys and values of earlier steps are kept.
+A kept key has seen K steps of its own, so that L layers reach back L (K - 1) + 1 steps: this is what training on longer
+pieces computes.
 """
 
 import functools
@@ -55,12 +58,15 @@ class ModelConfig(Checked):
     )
     # e^commitment times likelier
     skill: bool = False  # the head is the low-level controller, which stays as it is: the trunk tells it where to go
+    acting: Literal["cache", "window"] = "cache"  # keep keys and values, or compute the last K steps anew (paper)
     stride: Annotated[int, Within(1, 1000)] = 1  # control steps from one step of the memory to the next (paper: 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.width % self.heads:
             raise UserError(f"ModelConfig.width is {self.width}; give a multiple of heads, {self.heads}")
+        if self.acting == "window" and (self.stride > 1 or self.commitment > 0):
+            raise UserError("ModelConfig.acting 'window' knows neither stride nor commitment; use acting 'cache'")
 
     @property
     def tokens(self) -> int:
@@ -68,6 +74,7 @@ class ModelConfig(Checked):
         return 3 if self.actions else 2
 
 
+_RECORDED = ("map", "proprio", "goal", "action", "rtg")  # of each step, in the order of ``ControlTransformer.propose``
 _NEVER = -(10**6)  # the step of a token that is not there
 
 
@@ -86,6 +93,21 @@ class Cache:
     now: Int[Array, ""]  # steps taken, of all memories
     action: Float[Array, "N S A"]  # last action of each memory
     mode: Int[Array, "N"]  # which of the modes it was; -1, which is none of them, before the first
+
+
+@struct.dataclass
+class History:
+    """The last K steps of N episodes, the oldest first, from which ``acting="window"`` computes each action anew.
+
+    Before K steps were taken, the places after the present step are empty.
+    """
+
+    map: UInt8[Array, "N K 2 k k"]
+    proprio: Float[Array, "N K P"]
+    goal: Float[Array, "N K 2"]  # from the robot [m]
+    action: Float[Array, "N K A"]
+    rtg: Float[Array, "N K"]
+    now: Int[Array, ""]  # steps taken
 
 
 class MapEncoder(nn.Module):
@@ -375,6 +397,33 @@ class ControlTransformer(nn.Module):
         actions = jax.lax.dynamic_update_slice(cache.action, action[:, None], (0, which, 0))
         return action, Cache(tuple(keys), tuple(values), all_steps, cache.now + 1, actions, mode)
 
+    def act_on_window(
+        self,
+        history: History,
+        maps: UInt8[Array, "N 2 k k"],
+        proprio: Float[Array, "N P"],
+        goal: Float[Array, "N 2"],
+        rtg: Float[Array, "N"],
+    ) -> tuple[Float[Array, "N A"], History]:
+        """The next action of N episodes, from the last K steps and this one."""
+        places = history.rtg.shape[1]
+        place = jnp.minimum(history.now, places - 1)
+        shift = (history.now >= places).astype(jnp.int32)
+
+        def put(kept: jax.Array, new: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_index_in_dim(jnp.roll(kept, -shift, axis=1), new, place, 1)
+
+        blank = jnp.zeros_like(history.action[:, 0])
+        new = (maps, proprio, goal, blank, rtg)
+        window = [put(getattr(history, name), value) for name, value in zip(_RECORDED, new, strict=True)]
+        order = jnp.arange(places)
+        timestep = jnp.broadcast_to(history.now - place + order, history.rtg.shape)
+        valid = jnp.broadcast_to((order <= place).astype(jnp.float32), history.rtg.shape)
+        modes = self.propose(*window, timestep, valid, context=places)
+        action = jnp.clip(jax.lax.dynamic_index_in_dim(modes.best(), place, 1, keepdims=False), -1.0, 1.0)
+        window[_RECORDED.index("action")] = jax.lax.dynamic_update_index_in_dim(window[3], action, place, 1)
+        return action, History(*window, history.now + 1)
+
 
 def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
     """Whether a token of step ``query`` may see one of step ``key``: not later, and less than ``context`` ago."""
@@ -394,6 +443,14 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
         action=jnp.zeros((n, config.stride, action_size)),
         mode=jnp.full(n, -1, jnp.int32),
     )
+
+
+def empty_history(config: ModelConfig, proprio_size: int, action_size: int, n: int) -> History:
+    """The history before the first step of N episodes."""
+    k = config.context_acting
+    proprio, goal, action = (jnp.zeros((n, k, size)) for size in (proprio_size, 2, action_size))
+    maps = jnp.zeros((n, k, 2, MAP_CELLS, MAP_CELLS), jnp.uint8)
+    return History(maps, proprio, goal, action, jnp.zeros((n, k)), jnp.zeros((), jnp.int32))
 
 
 def sample_inputs(proprio_size: int, action_size: int) -> tuple[jax.Array, ...]:

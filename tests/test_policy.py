@@ -75,10 +75,23 @@ def test_actions_are_within_bounds_meant_and_done(policy, start):
     np.testing.assert_array_equal(action.target, action.done)
 
 
+def test_a_policy_acts_on_a_window_as_its_settings_say(policy, start):
+    """As with a cache for K steps, with the same return asked for, and then otherwise."""
+    deep = replace(CONFIG, layers=2)
+    params = jax.jit(ControlTransformer(deep, 2).init)(jax.random.key(3), *sample_inputs(2, 2))
+    params = jax.tree.map(lambda leaf: leaf + 0.3 * jax.random.normal(jax.random.key(1), leaf.shape), params)
+    cached = policy.replace(config=deep, params=params)
+    window = cached.replace(config=replace(deep, acting="window"))
+    (rtg, _, _, kept), (rtg_window, _, _, anew) = walk(cached, start), walk(window, start)
+    np.testing.assert_allclose(rtg[: CONFIG.context], rtg_window[: CONFIG.context], rtol=1e-5)
+    np.testing.assert_allclose(kept.done[: CONFIG.context], anew.done[: CONFIG.context], atol=1e-4)
+    assert np.abs(np.asarray(kept.done) - anew.done).max() > 1e-4
+
+
 def test_a_rollout_is_the_forward_pass_on_what_it_recorded(policy, start):
     """State, return and action tokens come from the episode as it went, in the order of training."""
     _, memory, steps = rollout(ENV, policy, start, policy.init(start), jax.random.key(0), STEPS)
-    assert int(memory.cache.now) == STEPS
+    assert int(memory.past.now) == STEPS
     rtg = np.asarray(walk(policy, start)[0])
     mazes = start.info["maze"]
 

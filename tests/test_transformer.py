@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics, specs
 
+from ct_envs import UserError
 from ct_envs.occupancy import MAP_CELLS
 from ct_jax.controllers.sac import SacConfig, SacController, controller_networks
 from ct_jax.transformer import (
@@ -19,6 +20,7 @@ from ct_jax.transformer import (
     Modes,
     band,
     empty_cache,
+    empty_history,
     sample_inputs,
     with_skill,
 )
@@ -32,7 +34,7 @@ def episode(seed: int, batch: int = 2, steps: int = 12) -> dict[str, jax.Array]:
     """A random piece of an episode."""
     keys = jax.random.split(jax.random.key(seed), 5)
     return {
-        "maps": jax.random.bernoulli(keys[0], 0.4, (batch, steps, 2, MAP_CELLS, MAP_CELLS)).astype(jnp.float32),
+        "maps": jax.random.bernoulli(keys[0], 0.4, (batch, steps, 2, MAP_CELLS, MAP_CELLS)).astype(jnp.uint8),
         "proprio": jax.random.normal(keys[1], (batch, steps, P)),
         "goal": 10 * jax.random.normal(keys[2], (batch, steps, 2)),
         "action": jax.random.uniform(keys[3], (batch, steps, A), minval=-1.0),
@@ -126,12 +128,14 @@ def act_along(config: ModelConfig, params, piece):
     model = ControlTransformer(config, A)
     n, steps = piece["rtg"].shape
     states = [jnp.swapaxes(piece[name], 0, 1) for name in ("maps", "proprio", "goal", "rtg")]
+    window = config.acting == "window"
 
-    def once(cache, state):
-        action, cache = model.apply(params, cache, *state, method="act")
-        return cache, action
+    def once(past, state):
+        action, past = model.apply(params, past, *state, method="act_on_window" if window else "act")
+        return past, action
 
-    _, actions = jax.lax.scan(once, empty_cache(config, A, n), states, length=steps)
+    past = empty_history(config, piece["proprio"].shape[-1], A, n) if window else empty_cache(config, A, n)
+    _, actions = jax.lax.scan(once, past, states, length=steps)
     return jnp.swapaxes(actions, 0, 1)
 
 
@@ -154,6 +158,30 @@ def test_acting_without_past_actions_is_the_forward_pass(layers, acting):
     piece = episode(layers, steps=21)
     whole = predict(config, piece, context=acting)
     np.testing.assert_allclose(act_along(config, params_of(config), piece), np.clip(whole, -1.0, 1.0), atol=1e-4)
+
+
+@pytest.mark.parametrize(("layers", "k", "actions"), [(1, 4, True), (3, 4, True), (3, 6, False), (2, 1, True)])
+def test_acting_on_a_window_is_training_on_pieces_of_its_length(layers, k, actions):
+    """Each action is the last one of the forward pass on the last K steps alone; a cache of K remembers more."""
+    config = replace(
+        TINY, layers=layers, context=k, context_acting=k, acting="window", actions=actions, max_timestep=64
+    )
+    piece = episode(layers, steps=13)
+    acted = act_along(config, params_of(config), piece)
+    for t in range(13):
+        first = max(0, t + 1 - k)
+        last = {name: leaf[:, first : t + 1] for name, leaf in (piece | {"action": acted}).items()}
+        np.testing.assert_allclose(acted[:, t], np.clip(predict(config, last)[:, -1], -1.0, 1.0), atol=1e-4)
+    kept = act_along(replace(config, acting="cache"), params_of(config), piece)
+    np.testing.assert_allclose(kept[:, :k], acted[:, :k], atol=1e-4)
+    if layers > 1 and k > 1:
+        assert np.abs(kept - acted).max() > 1e-3
+
+
+def test_a_window_knows_neither_stride_nor_commitment():
+    for wrong in ({"stride": 2}, {"commitment": 1.0}):
+        with pytest.raises(UserError, match="acting"):
+            replace(TINY, acting="window", **wrong)
 
 
 @pytest.mark.parametrize("stride", [2, 5])
@@ -330,7 +358,7 @@ def test_timesteps_past_the_last_embedding_have_the_last():
 
 
 def test_the_map_encoder_is_two_convolutions():
-    maps = episode(0, batch=1, steps=3)["maps"]
+    maps = episode(0, batch=1, steps=3)["maps"].astype(jnp.float32)
     encoder = MapEncoder(8)
     variables = jax.jit(encoder.init)(jax.random.key(0), maps)
     variables = jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(jax.random.key(1), leaf.shape), variables)
