@@ -1,4 +1,4 @@
-"""What 10^6 trajectories, 8 GPUs and 64 hosts would take: ``docs/scale.md``, from what smaller machines measured.
+"""What 10^6 trajectories, 8 GPUs and 64 hosts would take: ``docs/scaling.md``, from what smaller machines measured.
 
     python benchmarks/scale.py
 
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import tyro
-from _harness import RESULTS, about
+from _harness import RESULTS
 from transformer import trajectories
 
 from ct_envs import UserError, load_maze, stack_mazes
@@ -31,7 +31,7 @@ from ct_jax.model import sizes
 from ct_jax.presets import Settings, get_preset
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
-PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
+PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 SMALL = 1024  # trajectories of the program whose memory and messages are XLA's
 INT32 = 2**31 - 1  # steps that windows can be drawn from
 
@@ -327,5 +327,5 @@ def main(options: ScaleOptions) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")  # for XLA to have messages to count
-    chosen = tyro.cli(ScaleOptions, description=about(__doc__))
+    chosen = tyro.cli(ScaleOptions, description=__doc__)
     raise SystemExit(guarded(lambda: main(chosen)))
