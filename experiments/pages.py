@@ -66,8 +66,8 @@ each of its rows. [Reproducing](../reproducing.md) says how to make them again.
 """
 
 CACHED = """
-All rows of `ct`, `published` and the other methods as published were measured with a key/value cache, whose memory
-reaches `layers x (K - 1) + 1` steps. The [method](../method.md#acting) page says what differs today.
+Rows as published (*CT*, *BC-CT*, *F-CT*; `ct`, `bc-ct`, `f-ct` of the Turtlebot3) were measured with a key/value cache,
+whose memory reaches `layers x (K - 1) + 1` steps. [Method](../method.md#acting) says why that matters.
 """
 
 COLUMNS = """
