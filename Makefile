@@ -11,7 +11,7 @@ PIP_TOOLS := pip-tools==7.6.2
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-resume check format bench lock clean
+.PHONY: help setup demo test test-resume check format bench pages docs lock clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -54,9 +54,16 @@ format: setup ## Format the code and mend what the linter can mend
 	@$(BIN)/ruff check --fix-only .
 	@$(BIN)/ruff format .
 
-# The commit is asked for once: the benchmarks write their tables into the sources, and that is no change of the code.
+# The commit is asked for once: the results that each benchmark writes are no change of the code.
 bench: setup ## Run every benchmark (12 minutes on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
-	@export BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; for script in $(filter-out benchmarks/scale.py,$(sort $(wildcard benchmarks/[a-z]*.py))) benchmarks/scale.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
+	@export BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; for script in $(filter-out benchmarks/scale.py,$(sort $(wildcard benchmarks/[a-z]*.py))) benchmarks/scale.py experiments/pages.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
+
+pages: setup ## Write the results pages and plots from the result files
+	@$(BIN)/python experiments/pages.py
+
+docs: setup ## Build the pages of docs/ as a site in site/; broken links and anchors are errors
+	@$(BIN)/zensical build --strict
+	@echo "Open site/index.html"
 
 # pip-tools lives in an environment of its own, so that it can neither be locked nor disturb what is.
 lock: ## Remake requirements.lock (needs Python 3.11 on Linux x86-64)
@@ -65,9 +72,9 @@ lock: ## Remake requirements.lock (needs Python 3.11 on Linux x86-64)
 	@echo "Resolving requirements.lock (versions already in it are kept; UPGRADE=--upgrade renews them)"
 	@CUSTOM_COMPILE_COMMAND="make lock" .make/lock/bin/pip-compile --quiet $(UPGRADE) \
 	    --generate-hashes --strip-extras --allow-unsafe --no-emit-options \
-	    --extra dev --extra turtlebot3 --extra video --build-deps-for editable --constraint .ci/constraints.txt \
+	    --extra dev --extra turtlebot3 --extra video --extra docs --build-deps-for editable --constraint .ci/constraints.txt \
 	    --output-file requirements.lock pyproject.toml
 
 clean: ## Remove .venv, builds and caches (runs/ stays)
-	rm -rf $(VENV) .make build dist .pytest_cache .ruff_cache .hypothesis tests/.jax_cache
+	rm -rf $(VENV) .make build dist site .cache .pytest_cache .ruff_cache .hypothesis tests/.jax_cache
 	find . -name __pycache__ -type d -not -path './runs/*' -prune -exec rm -rf {} +

@@ -1,10 +1,9 @@
-"""What all benchmarks share: contestants timed in turn, a table, ``results/NAME.json``, the table in the docstring.
+"""What all benchmarks share: contestants timed in turn, a printed table, and ``benchmarks/results/NAME.json``.
 
-The table at the end of a benchmark's docstring is made from its results on a CPU and nothing else; those of an
-accelerator are in ``results/NAME-gpu.json`` alone.
+Results of an accelerator have a file of their own, ``NAME-gpu.json``. ``python experiments/pages.py`` writes all of
+them to ``docs/speed.md``.
 """
 
-import ast
 import importlib.util
 import io
 import json
@@ -29,10 +28,9 @@ from ct_jax.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
 PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")
-LAST = "\n\nLast results:\n\n"
 _WIDTH = 116
 _FEWEST = 2  # rounds of a race
-COMMIT = "BENCH_COMMIT"  # variable in which ``make bench`` names the commit: what it writes is no change of the code
+COMMIT = "BENCH_COMMIT"  # variable in which ``make bench`` names the commit: new results are no change of the code
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Options:
     limit_s: float = 4.0
     """Time after which a race ends with fewer rounds than that, but at least two (--full: none)."""
     write: bool = True
-    """Keep the results, and the table in the docstring; without it they are only printed."""
+    """Keep the results; without it they are only printed."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +62,6 @@ def has_peer(module: str, name: str) -> bool:
     if not there:
         print(f"{name} is not installed, so it is not measured: pip install -e '.[bench]'")
     return there
-
-
-def about(docstring: str | None) -> str:
-    """A docstring without its table."""
-    return (docstring or "").split(LAST)[0]
 
 
 def time_together(*contestants: Contestant, repeat: int, limit_s: float = math.inf) -> list[list[float]]:
@@ -150,7 +143,7 @@ class Results:
         return times[0]
 
     def finish(self) -> None:
-        """Print the table, and write it down."""
+        """Print the table, and keep the results."""
         self._made["versions"] |= {name: metadata.version(name) for name in PEERS if _installed(name)}
         rows = [row | {"made": self._made} for row in self._rows]
         print(table_of(rows))
@@ -159,8 +152,7 @@ class Results:
             on_cpu = jax.default_backend() == "cpu"
             file = RESULTS / f"{self.file.stem}{'' if on_cpu else '-gpu'}.json"
             file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-            if on_cpu:
-                self.file.write_text(with_table(self.file.read_text("utf-8"), table_of(rows)), "utf-8")
+            print(f"results: {file}\npage:    python experiments/pages.py writes it to docs/speed.md")
 
 
 def _installed(name: str) -> bool:
@@ -175,7 +167,7 @@ def _number(value: float) -> str:
 
 
 def table_of(rows: list[dict[str, Any]]) -> str:
-    """Results as a heading and a table in plain text, no line longer than the sources' are."""
+    """Results as a heading and a table in plain text."""
     made = rows[0]["made"]
     versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
     table = Table(box=box.MARKDOWN)
@@ -192,12 +184,3 @@ def table_of(rows: list[dict[str, Any]]) -> str:
     console.print(f"{made['created'][:10]}, commit {made['commit']}, {made['hardware']}: {versions}\n", highlight=False)
     console.print(table)
     return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines()).strip()  # pyright: ignore
-
-
-def with_table(source: str, table: str) -> str:
-    """A Python source with the table at the end of its docstring, in place of the one there."""
-    docstring = ast.parse(source).body[0]
-    lines = source.splitlines(keepends=True)
-    text, rest = "".join(lines[: docstring.end_lineno]), "".join(lines[docstring.end_lineno :])
-    head = about(text.rstrip().removesuffix('"""')).rstrip()
-    return f'{head}{LAST}{table}\n"""\n{rest}'

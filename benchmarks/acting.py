@@ -6,48 +6,6 @@ Ours computes the three new tokens and looks back at cached keys and values; the
 tokens again, which is how Hugging Face's Decision Transformer acts (torch; same widths, and a CNN as ours in front).
 ``cpu`` is the model of that preset, ``paper`` the paper's. Sizes at which a contestant would want more memory than
 ``--memory-gb``, or recomputing more than ``--recompute-steps`` tokens' states, are left out for it.
-
-Last results:
-
-2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
-brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
-gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
-
-
-| what                 | median (min-max)    | unit | against              | its    | times (min-max)      | asked |
-|----------------------|---------------------|------|----------------------|--------|----------------------|-------|
-| cpu model, 1         | 0.372 (0.16-0.461)  | ms   | recomputing the      | 0.732  | 1.97 (1.69-6.46)     |       |
-| environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 1         | 0.372 (0.16-0.461)  | ms   | Hugging Face, torch  | 2.64   | 10.85 (5.92-30.26)   |       |
-| environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 1         | 0.217 (0.199-0.507) | ms   | recomputing the      | 4.79   | 22.91 (9.09-31.80)   |       |
-| environments, K=50   |                     |      | window               |        |                      |       |
-| cpu model, 1         | 0.217 (0.199-0.507) | ms   | Hugging Face, torch  | 4.57   | 21.72 (8.17-43.08)   |       |
-| environments, K=50   |                     |      |                      |        |                      |       |
-| cpu model, 1         | 0.385 (0.365-0.647) | ms   | recomputing the      | 42.7   | 111.22               |       |
-| environments, K=200  |                     |      | window               |        | (68.74-117.08)       |       |
-| cpu model, 1         | 0.385 (0.365-0.647) | ms   | Hugging Face, torch  | 11.5   | 30.42 (18.04-33.43)  |       |
-| environments, K=200  |                     |      |                      |        |                      |       |
-| cpu model, 100       | 4.24 (4.13-4.35)    | ms   | recomputing the      | 14.8   | 3.48 (3.40-4.29)     |       |
-| environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 100       | 4.24 (4.13-4.35)    | ms   | Hugging Face, torch  | 17.5   | 4.21 (3.96-6.30)     |       |
-| environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 100       | 8.69 (8.2-9.05)     | ms   | recomputing the      | 314    | 37.10 (35.04-37.46)  |       |
-| environments, K=50   |                     |      | window               |        |                      |       |
-| cpu model, 100       | 8.69 (8.2-9.05)     | ms   | Hugging Face, torch  | 178    | 20.35 (18.38-27.67)  |       |
-| environments, K=50   |                     |      |                      |        |                      |       |
-| cpu model, 100       | 29.5 (28.8-30.2)    | ms   | recomputing the      | 5,223  | 177.19               |       |
-| environments, K=200  |                     |      | window               |        | (174.10-180.28)      |       |
-| cpu model, 100       | 29.5 (28.8-30.2)    | ms   | Hugging Face, torch  | 1,191  | 40.31 (36.97-43.66)  |       |
-| environments, K=200  |                     |      |                      |        |                      |       |
-| cpu model, 4096      | 157 (148-158)       | ms   | recomputing the      | 705    | 4.50 (4.47-4.76)     |       |
-| environments, K=5    |                     |      | window               |        |                      |       |
-| cpu model, 4096      | 157 (148-158)       | ms   | Hugging Face, torch  | 892    | 5.63 (5.20-6.16)     |       |
-| environments, K=5    |                     |      |                      |        |                      |       |
-| cpu model, 4096      | 369 (362-378)       | ms   |                      |        |                      |       |
-| environments, K=50   |                     |      |                      |        |                      |       |
-| paper model, 100     | 117 (115-119)       | ms   | Hugging Face, torch  | 11,226 | 96.08 (92.22-99.95)  | 100   |
-| environments, K=200  |                     |      |                      |        |                      |       |
 """
 
 import functools
@@ -59,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from _harness import Contestant, Options, Results, about, has_peer
+from _harness import Contestant, Options, Results, has_peer
 
 from ct_jax.presets import get_preset
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache, sample_inputs
@@ -179,4 +137,4 @@ def peer(config: ModelConfig, inputs: dict[str, np.ndarray]) -> Contestant:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(ActingOptions, description=about(__doc__)))
+    main(tyro.cli(ActingOptions, description=__doc__))

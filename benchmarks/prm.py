@@ -7,36 +7,6 @@ over pairs of points, over the wall cells near each, and over the goals of the t
 number of samples and of neighbours that ours has on average, states checked by a Python function, as PyPI's package
 has it; it samples its edges every 0.1 m, where ours are exact, and has no table. Roadmaps are built several
 in a row, as a collection builds them.
-
-Last results:
-
-2026-11-25, commit 08323bd, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
-brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
-gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
-
-
-| what                         | median (min-max)    | unit | against        | its   | times (min-max)     | asked |
-|------------------------------|---------------------|------|----------------|-------|---------------------|-------|
-| 100 samples: build           | 1.54 (1.52-1.71)    | ms   | OMPL           | 6.8   | 4.40 (4.05-4.46)    |       |
-| 100 samples: build           | 1.52 (1.51-1.66)    | ms   | Python loop    | 4.54  | 2.99 (2.72-8.28)    |       |
-| 100 samples: build and table | 3.85 (3.73-3.97)    | ms   | Python loop    | 28.9  | 7.50 (7.29-7.75)    |       |
-| 100 samples: a plan          | 1.48 (1.45-1.64)    | ms   | Python loop    | 0.378 | 0.25 (0.23-0.26)    |       |
-| 100 samples: a plan          | 1.48 (1.45-1.64)    | ms   | OMPL           | 1.54  | 1.02 (0.66-1.76)    |       |
-| 200 samples: build           | 2.01 (1.98-2.96)    | ms   | OMPL           | 27.9  | 13.88 (8.92-14.17)  |       |
-| 200 samples: build           | 2.01 (1.98-2.07)    | ms   | Python loop    | 17.5  | 8.71 (8.59-8.85)    |       |
-| 200 samples: build and table | 10.6 (9.76-11.7)    | ms   | Python loop    | 171   | 15.95 (14.66-17.98) |       |
-| 200 samples: a plan          | 1.82 (1.78-2.02)    | ms   | Python loop    | 0.785 | 0.43 (0.39-0.45)    |       |
-| 200 samples: a plan          | 1.82 (1.78-2.02)    | ms   | OMPL           | 12.1  | 6.06 (3.40-12.64)   |       |
-| 1000 samples: build          | 9.35 (8.6-14.2)     | ms   | OMPL           | 490   | 52.18 (34.88-57.12) | 2     |
-| 1000 samples: build          | 9.93 (9.16-14.3)    | ms   | Python loop    | 458   | 46.15 (32.74-49.71) | 50    |
-| 1000 samples: build and      | 391 (376-399)       | ms   |                |       |                     |       |
-| table                        |                     |      |                |       |                     |       |
-| 1000 samples: a plan         | 7.45 (7.41-7.47)    | ms   | Python loop    | 14.9  | 2.01 (1.88-2.02)    |       |
-| 1000 samples: a plan         | 7.45 (7.41-7.47)    | ms   | OMPL           | 136   | 18.19 (13.89-20.55) |       |
-| 5000 samples: build          | 233 (203-383)       | ms   |                |       |                     |       |
-| 5000 samples: a plan         | 180 (180-180)       | ms   | Python loop    | 740   | 4.11 (4.08-4.14)    |       |
-| growth: an edge at 5000      | 0.154 (0.144-0.222) | µs   | an edge at 200 | 1.36  | 9.09 (6.13-10.03)   | 0.769 |
-| samples                      |                     |      |                |       |                     |       |
 """
 
 import math
@@ -48,7 +18,7 @@ import jax
 import networkx as nx
 import numpy as np
 import tyro
-from _harness import Contestant, Options, Results, about, has_peer
+from _harness import Contestant, Options, Results, has_peer
 
 from ct_envs import load_maze
 from ct_envs.maze import Maze
@@ -279,4 +249,4 @@ class OmplPlanner:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(PrmOptions, description=about(__doc__)))
+    main(tyro.cli(PrmOptions, description=__doc__))

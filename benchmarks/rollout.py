@@ -9,70 +9,6 @@ control steps of the same model with the same actions and does nothing else: ``m
 are run side by side, one process an environment, with as many as gives the most steps/s, and brax's own ant under vmap
 (without a maze or resets). A control step is five physics steps for all of them. *collection* is Algorithm 3 with the
 shipped controllers and the settings of the preset ``cpu``, roadmaps included.
-
-Last results:
-
-2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
-brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
-gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
-
-
-| what              | median (min-max)  | unit           | against           | its     | times (min-max)   | asked |
-|-------------------|-------------------|----------------|-------------------|---------|-------------------|-------|
-| point, mujoco, 1  | 13,595            | steps/s        | raw mujoco.batch  | 97,154  | 0.14 (0.14-0.15)  |       |
-| envs, maps        | (13,097-14,188)   |                |                   |         |                   |       |
-| point, mujoco, 64 | 103,258           | steps/s        | raw mujoco.batch  | 195,895 | 0.53 (0.48-0.55)  |       |
-| envs, maps        | (97,597-107,658)  |                |                   |         |                   |       |
-| point, mujoco,    | 155,889           | steps/s        | raw mujoco.batch  | 217,015 | 0.71 (0.61-0.73)  |       |
-| 256 envs, maps    | (131,526-157,968) |                |                   |         |                   |       |
-| point, mujoco,    | 178,569           | steps/s        | raw mujoco.batch  | 221,060 | 0.80 (0.71-0.83)  |       |
-| 256 envs, proprio | (157,279-184,002) |                |                   |         |                   |       |
-| point, mujoco,    | 150,188           | steps/s        | raw mujoco.batch  | 216,109 | 0.72 (0.67-0.79)  |       |
-| 256 envs, nothing | (146,054-159,970) |                |                   |         |                   |       |
-| point, mujoco,    | 181,885           | steps/s        | raw mujoco.batch  | 228,905 | 0.79 (0.78-0.83)  |       |
-| 4096 envs, maps   | (178,081-185,100) |                |                   |         |                   |       |
-| point, mjx, 64    | 48,261            | steps/s        | raw mjx.step      | 64,652  | 0.75 (0.71-0.80)  |       |
-| envs, maps        | (45,931-51,077)   |                |                   |         |                   |       |
-| point, growth: a  | 5.53 (5.36-6.08)  | µs             | a step of 64      | 9.06    | 1.59 (1.49-1.72)  | 0.769 |
-| step of 4096      |                   |                |                   |         |                   |       |
-| ant, mujoco, 1    | 7,603             | steps/s        | raw mujoco.batch  | 20,835  | 0.35 (0.34-0.37)  |       |
-| envs, maps        | (7,026-7,831)     |                |                   |         |                   |       |
-| ant, mujoco, 64   | 34,543            | steps/s        | raw mujoco.batch  | 39,993  | 0.86 (0.83-0.90)  |       |
-| envs, maps        | (33,769-35,025)   |                |                   |         |                   |       |
-| ant, mujoco, 256  | 37,441            | steps/s        | raw mujoco.batch  | 39,705  | 0.92 (0.89-1.01)  | 0.88  |
-| envs, maps        | (35,271-38,132)   |                |                   |         |                   |       |
-| ant, mujoco, 256  | 38,951            | steps/s        | raw mujoco.batch  | 41,989  | 0.93 (0.88-0.97)  |       |
-| envs, proprio     | (37,352-41,254)   |                |                   |         |                   |       |
-| ant, mujoco, 256  | 40,815            | steps/s        | raw mujoco.batch  | 42,618  | 0.96 (0.92-0.96)  |       |
-| envs, nothing     | (38,965-41,540)   |                |                   |         |                   |       |
-| ant, mujoco, 4096 | 38,773            | steps/s        | raw mujoco.batch  | 44,844  | 0.86 (0.83-0.88)  |       |
-| envs, maps        | (36,913-39,998)   |                |                   |         |                   |       |
-| ant, mjx, 64      | 908 (876-921)     | steps/s        | raw mjx.step      | 968     | 0.93 (0.92-0.96)  |       |
-| envs, maps        |                   |                |                   |         |                   |       |
-| ant, growth: a    | 26.7 (26.5-27.2)  | µs             | a step of 64      | 30.1    | 1.14 (1.10-1.16)  | 0.769 |
-| step of 4096      |                   |                |                   |         |                   |       |
-| ant, 256 envs,    | 33,705            | steps/s        | Gymnasium-Roboti… | 2,713   | 12.37             | 12    |
-| maps              | (28,242-35,775)   |                | AntMaze_Large-v5  |         | (10.37-13.29)     |       |
-| ant, 256 envs,    | 33,705            | steps/s        | OGBench,          | 2,799   | 12.09             |       |
-| maps              | (28,242-35,775)   |                | antmaze-large-v0  |         | (9.68-14.16)      |       |
-| ant, 256 envs,    | 33,705            | steps/s        | brax ant, backend | 13,217  | 2.55 (2.08-3.00)  |       |
-| maps              | (28,242-35,775)   |                | mjx               |         |                   |       |
-| point, collection | 167 (161-175)     | trajectories/s |                   |         |                   |       |
-| guided by roadmap |                   |                |                   |         |                   |       |
-| point, collection | 108 (102-110)     | trajectories/s |                   |         |                   |       |
-| guided by         |                   |                |                   |         |                   |       |
-| shortcut          |                   |                |                   |         |                   |       |
-| point, collection | 108 (108-109)     | trajectories/s |                   |         |                   |       |
-| guided by         |                   |                |                   |         |                   |       |
-| explorer          |                   |                |                   |         |                   |       |
-| ant, collection   | 32.9 (32.8-32.9)  | trajectories/s |                   |         |                   |       |
-| guided by roadmap |                   |                |                   |         |                   |       |
-| ant, collection   | 30.5 (29.7-31.4)  | trajectories/s |                   |         |                   |       |
-| guided by         |                   |                |                   |         |                   |       |
-| shortcut          |                   |                |                   |         |                   |       |
-| ant, collection   | 24.1 (23.7-24.6)  | trajectories/s |                   |         |                   |       |
-| guided by         |                   |                |                   |         |                   |       |
-| explorer          |                   |                |                   |         |                   |       |
 """
 
 import importlib
@@ -85,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from _harness import Contestant, Options, Results, about, has_peer
+from _harness import Contestant, Options, Results, has_peer
 from mujoco import mjx
 from mujoco.batch import Batch
 
@@ -339,4 +275,4 @@ def collection(robot: str, options: RolloutOptions, results: Results) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(RolloutOptions, description=about(__doc__)))
+    main(tyro.cli(RolloutOptions, description=__doc__))

@@ -9,34 +9,6 @@ An episode that times out ends for the peer as one that fails: ours go on by the
 not kept. *Products alone* is as much work as an update's, counted by XLA, in nothing but matrix products of its size,
 four that do not wait for each other: what no learner with this batch and these networks can outrun here. With --full
 the peer, too, learns until it walks 90 % of the edges.
-
-Last results:
-
-2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
-brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
-gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
-
-
-| what                     | median (min-max)    | unit      | against           | its  | times (min-max)  | asked |
-|--------------------------|---------------------|-----------|-------------------|------|------------------|-------|
-| point, 1 environments, 1 | 231 (219-243)       | updates/s | products alone    | 464  | 0.50 (0.49-0.51) |       |
-| updates a step           |                     |           |                   |      |                  |       |
-| point, 1 environments, 1 | 231 (219-243)       | updates/s | Stable-Baselines3 | 92.1 | 2.51 (2.44-2.57) | 2.5   |
-| updates a step           |                     |           |                   |      |                  |       |
-| point, 64 environments,  | 262 (249-274)       | updates/s | products alone    | 475  | 0.55 (0.53-0.57) |       |
-| 8 updates a step         |                     |           |                   |      |                  |       |
-| point, 64 environments,  | 262 (249-274)       | updates/s | Stable-Baselines3 | 97.1 | 2.72 (2.37-3.07) | 5     |
-| 8 updates a step         |                     |           |                   |      |                  |       |
-| ant, 1 environments, 1   | 191 (182-199)       | updates/s | products alone    | 388  | 0.49 (0.47-0.51) |       |
-| updates a step           |                     |           |                   |      |                  |       |
-| ant, 1 environments, 1   | 191 (182-199)       | updates/s | Stable-Baselines3 | 72.6 | 2.62 (2.62-2.63) | 2.5   |
-| updates a step           |                     |           |                   |      |                  |       |
-| ant, 64 environments, 8  | 207 (205-210)       | updates/s | products alone    | 428  | 0.49 (0.47-0.50) |       |
-| updates a step           |                     |           |                   |      |                  |       |
-| ant, 64 environments, 8  | 207 (205-210)       | updates/s | Stable-Baselines3 | 107  | 1.95 (1.84-2.06) | 5     |
-| updates a step           |                     |           |                   |      |                  |       |
-| point: until 90 % of the | 0.916 (0.916-0.916) | s         |                   |      |                  |       |
-| edges are walked         |                     |           |                   |      |                  |       |
 """
 
 import time
@@ -48,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from _harness import Contestant, Options, Results, about, has_peer
+from _harness import Contestant, Options, Results, has_peer
 from flax import struct
 
 from ct_envs import MazeEnv, Tasks, load_maze
@@ -284,4 +256,4 @@ def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(SacOptions, description=about(__doc__)))
+    main(tyro.cli(SacOptions, description=__doc__))

@@ -1,4 +1,4 @@
-"""What 10^6 trajectories, 8 GPUs and 64 hosts would take: ``docs/scale.md``, from what smaller machines measured.
+"""What 10^6 trajectories, 8 GPUs and 64 hosts would take: ``docs/scaling.md``, from what smaller machines measured.
 
     python benchmarks/scale.py
 
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import tyro
-from _harness import RESULTS, about
+from _harness import RESULTS
 from transformer import trajectories
 
 from ct_envs import UserError, load_maze, stack_mazes
@@ -31,7 +31,7 @@ from ct_jax.model import sizes
 from ct_jax.presets import Settings, get_preset
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
-PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
+PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 SMALL = 1024  # trajectories of the program whose memory and messages are XLA's
 INT32 = 2**31 - 1  # steps that windows can be drawn from
 
@@ -225,12 +225,12 @@ def limits(each: Plan, options: ScaleOptions, settings: Settings, assumed: Assum
     numbered = "draw the trajectory first, then its step"
     steps = options.trajectories * settings.collect.horizon
     found = [
-        Limit(f"pieces of a batch for {gpus} GPUs (asked: one each)", gpus / settings.fit.batch, batch),
+        Limit(f"windows of a batch for {gpus} GPUs (at least one each)", gpus / settings.fit.batch, batch),
         Limit("traffic of an update against its computation", each.traffic / each.compute, larger),
         Limit("roadmaps of a process against its share of rollouts", each.roadmaps / each.rollouts, waves),
         Limit("memory of a GPU", each.gpu / assumed.gpu_bytes, rows),
         Limit("memory of a host", each.host / assumed.host_bytes, copies),
-        Limit("steps that 32 bits can number, from which windows are drawn", steps / INT32, numbered),
+        Limit("steps of the data, which 32 bits must number", steps / INT32, numbered),
     ]
     return sorted(found, key=lambda limit: -limit.load)
 
@@ -263,7 +263,7 @@ def head(options: ScaleOptions, found: Measured, size: Sizes, assumed: Assumed) 
     """What the page is of, and where its figures come from."""
     gpus, hosts = assumed.gpus, options.hosts
     yield f"# {options.trajectories:,} trajectories on {gpus} GPUs, and on {hosts} hosts with as many each\n"
-    yield "Written by `python benchmarks/scale.py`; computed, not run: no machine of ours is so large.\n"
+    yield "Written by `python benchmarks/scale.py`; computed, not run.\n"
     yield f"Robot `{options.robot}`, preset `{options.preset}`. Measured:\n"
     yield "| row | value | on |\n|---|---|---|"
     for row in found:
@@ -280,8 +280,8 @@ def head(options: ScaleOptions, found: Measured, size: Sizes, assumed: Assumed) 
     yield (
         "\nAssumed (`Assumed` in the script says from where): "
         + ", ".join(f"`{field.name}` {getattr(assumed, field.name):,g}" for field in fields(assumed))
-        + ". Speed is taken to grow with cores and GPUs, which flatters; that traffic never "
-        "hides behind computation does not.\n"
+        + ". Speed is assumed to grow in proportion to cores and GPUs, which is optimistic. Traffic is assumed "
+        "never to overlap with computation, which is pessimistic.\n"
     )
 
 
@@ -308,7 +308,9 @@ def table(plans: list[Plan], settings: Settings) -> Iterator[str]:
 def breaks(plans: list[Plan], options: ScaleOptions, settings: Settings, assumed: Assumed) -> Iterator[str]:
     """What breaks first, and what to do about it."""
     yield "\n## What breaks first, and what to do\n"
-    yield "A load is what is asked over what there is. Above 1 it is broken, or costs more than what it serves."
+    yield (
+        "A load is the demand divided by the capacity. Above 1 the part is too small, or costs more time than the work."
+    )
     for each in plans:
         yield f"\n{each.hosts} host{'s' * (each.hosts > 1)}:\n\n| what | load | what to do |\n|---|---|---|"
         for limit in limits(each, options, settings, assumed):
@@ -327,5 +329,5 @@ def main(options: ScaleOptions) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")  # for XLA to have messages to count
-    chosen = tyro.cli(ScaleOptions, description=about(__doc__))
+    chosen = tyro.cli(ScaleOptions, description=__doc__)
     raise SystemExit(guarded(lambda: main(chosen)))

@@ -8,22 +8,6 @@ AdamW. The peer is Hugging Face's Decision Transformer in torch (same widths, ba
 batch that lies ready. The third contestant is a matrix product: the ratio is the share of its FLOP/s that our step
 reaches, counting XLA's count for one gradient of the loss without the drawing of windows.
 On a GPU the same in bfloat16 and with cuDNN's attention.
-
-Last results:
-
-2026-11-25, commit e8b0980, x86_64 CPU, 2 cores: ct-jax 0.1.0, python 3.11.7, jax 0.10.1, flax 0.12.8, optax 0.2.8,
-brax 0.14.2, mujoco 3.17.0, mujoco-mjx 3.17.0, orbax-checkpoint 0.12.8, numpy 2.4.6, networkx 3.6.1,
-gymnasium-robotics 1.4.2, ogbench 1.2.2, ompl 2.0.1, stable-baselines3 2.9.2, torch 2.13.0+cpu, transformers 5.23.0
-
-
-| what                | median (min-max)    | unit    | against                | its   | times (min-max)  | asked |
-|---------------------|---------------------|---------|------------------------|-------|------------------|-------|
-| turtlebot3, float32 | 13.4 (12.5-13.7)    | steps/s | float32 matrix product | 30.2  | 0.44 (0.43-0.45) |       |
-| turtlebot3, float32 | 13.4 (12.5-13.7)    | steps/s | Hugging Face, torch    | 10.1  | 1.31 (1.24-1.41) | 1.2   |
-| turtlebot3, float32 | 125 (117-128)       | GFLOP/s |                        |       |                  |       |
-| ant, float32        | 0.274 (0.266-0.281) | steps/s | float32 matrix product | 0.375 | 0.73 (0.71-0.76) |       |
-| ant, float32        | 0.274 (0.266-0.281) | steps/s | Hugging Face, torch    | 0.265 | 1.03 (0.96-1.10) | 1.2   |
-| ant, float32        | 188 (183-193)       | GFLOP/s |                        |       |                  |       |
 """
 
 from dataclasses import dataclass
@@ -33,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from _harness import Contestant, Options, Results, about, has_peer
+from _harness import Contestant, Options, Results, has_peer
 
 from ct_envs import load_maze, stack_mazes
 from ct_envs.robots import get_robot
@@ -152,4 +136,4 @@ def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant
 
 
 if __name__ == "__main__":
-    main(tyro.cli(TransformerOptions, description=about(__doc__)))
+    main(tyro.cli(TransformerOptions, description=__doc__))

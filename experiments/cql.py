@@ -1,24 +1,25 @@
-"""PT-CQL's settings, tuned as fairly as the other methods': in the training maze, on pairs that no table is made of.
+"""Chooses PT-CQL's settings as fairly as the other methods': in the training maze, on pairs that no table uses.
 
     python experiments/cql.py --robot ant [--alpha 0.05 0.2 1 5] [--target-rate 0.005 0.05] [--controller zoo]
 
-Each pair of settings is trained on the planning trajectories of the method as published, and tried in the training maze
-on 100 pairs of seed 7 (the tables' are of seed 0). Writes ``experiments/results/cql.json``; ``ct_jax/baselines/cql.py``
-holds what was chosen.
+Each choice is trained on the planning trajectories of the method as published, and evaluated in the training maze on
+100 pairs of seed 7 (the tables use seed 0). Writes ``experiments/results/cql.json``; ``study.pt_cql_config`` holds the
+choice.
 """
 
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import tyro
-from _variants import RESULTS, plan_for, pt_cql, replace_rows
+from rows import RESULTS, CqlRow, replace_rows
+from study import Study, load_variants, pt_cql
 
+from ct_envs import UserError
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
-from ct_jax.run import Run, default_mazes, load_mazes
 
 TUNING_SEED = 7  # of the pairs
+VARIED = ("alpha", "target_rate", "reward_scale", "imitation", "updates")
 
 
 @dataclass(frozen=True)
@@ -46,30 +47,30 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Try everything, writing down each as it is there."""
+    """Try all choices; each is written down as soon as it is measured."""
     prepare_jax()
-    plan = plan_for(options.robot, "cpu", controller=options.controller)
-    base: Any = plan.baselines["pt-cql"]
-    settings = replace(plan.variants["published"], pairs_seed=TUNING_SEED)
-    run = Run(
-        folder=options.out / options.robot, robot=options.robot, preset="published", settings=settings,
-        mazes=load_mazes(default_mazes(options.robot)[0]), eval_mazes={}, seed=options.seed, engine="auto",
-    )  # fmt: skip
+    variants = load_variants(options.robot)
+    if "pt-cql" not in variants:
+        raise UserError(f"--robot {options.robot}: has no PT-CQL; give point, ant or humanoid")
+    variant = variants["pt-cql"]
+    study = Study(robot=options.robot, preset="published", out=options.out, controller=options.controller)
+    made = study.make_run("pt-cql", variant, options.seed)
+    settings = replace(made.settings, pairs_seed=TUNING_SEED)
+    run = replace(made, folder=options.out / options.robot, settings=settings, eval_mazes={})
     grid = itertools.product(options.reward_scale, options.imitation, options.target_rate, options.alpha)
     for scale, imitation, rate, alpha in grid:
         tried = {"alpha": alpha, "target_rate": rate, "reward_scale": scale, "imitation": imitation}
-        config = replace(base, updates=options.updates, **tried)
+        config = replace(variant.baseline, updates=options.updates, **tried)
         tried["updates"] = options.updates
         name = "-".join(f"{name}={value:g}" for name, value in tried.items())
-        keep([tried | {"model_seed": run.seed} | row for row in pt_cql(run, config, name)])
+        keep([CqlRow.read(tried | {"model_seed": run.seed} | row) for row in pt_cql(run, config, name)])
 
 
-def keep(rows: list[dict]) -> None:
-    """Add rows to the results file in place of those of the same settings, and print them all."""
-    varied = {"a": "alpha", "r": "target_rate", "s": "reward_scale", "i": "imitation", "u": "updates"}
-    kept = replace_rows(RESULTS / "cql.json", rows, ("robot", *varied.values()))
-    short = lambda row: " ".join(f"{letter}{row[name]:g}" for letter, name in varied.items())  # noqa: E731
-    print_rows([row | {"method": short(row)} for row in kept if row["robot"] == rows[0]["robot"]])
+def keep(rows: list[CqlRow]) -> None:
+    """Add rows to the results file in place of those with the same settings, and print all of the robot."""
+    kept = replace_rows(RESULTS / "cql.json", rows, ("robot", *VARIED), CqlRow)
+    short = lambda row: " ".join(f"{name[0]}{getattr(row, name):g}" for name in VARIED)  # noqa: E731
+    print_rows([row.values() | {"method": short(row)} for row in kept if row.robot == rows[0].robot])
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""What fine-tuning adds, on more pairs than a table has: F-CT less CT in unseen mazes, pair by pair.
+"""Measures what fine-tuning adds, on more pairs than the tables have: F-CT − CT in unseen mazes, pair by pair.
 
     python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned modes] [--runs runs/ant] [--maze validation-2]
 
-In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, of which no table is made.
+In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, which no table uses.
 
-Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or, as ``--tuned`` says, of another name) of
-``experiments/ROBOT.py --preset cpu``, led by one controller. Both models of a seed meet the same pairs of seed 1; the
-tables' are of seed 0. Writes ``experiments/results/finetuned.json``.
+Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or those of another ``--tuned``) of
+``experiments/ROBOT.py --preset cpu``, with the same low-level controller. Both models of a seed meet the same pairs of
+seed 1; the tables use seed 0. Writes ``experiments/results/finetuned.json``.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import tyro
-from _variants import LONGER, RESULTS, TUNED, digest_of, origin, replace_rows, untuned
+from rows import CT, RESULTS, Row, origin_of, replace_rows
+from study import as_digits, digest_arrays, load_variants
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
@@ -24,11 +24,8 @@ from ct_jax.progress import Bar
 from ct_jax.run import provenance
 
 FILE = RESULTS / "finetuned.json"
+LONGER = "long-ct"  # CT with about as many updates as F-CT has in all
 PAIRS_SEED = 1
-if TYPE_CHECKING:
-    Tuned = str
-else:  # so that --help lists them
-    Tuned = tyro.extras.literal_type_from_choices(TUNED)
 
 
 @dataclass(frozen=True)
@@ -37,10 +34,10 @@ class Options:
 
     robot: str = "point"
     """point, ant or humanoid."""
-    tuned: Tuned = "cpu"
-    """Which F-CT to compare with its CT."""
+    tuned: str = "cpu"
+    """The fine-tuned variant to compare with the variant that it was before."""
     longer: bool = False
-    """Compare with long-ct instead, which learns for about as many updates as F-CT does."""
+    """Compare with long-ct instead, which has about as many updates as F-CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
     runs: Path | None = None
@@ -51,8 +48,8 @@ class Options:
     """Start-goal pairs."""
 
 
-def measure(options: Options, variant: str, seed: int, maze_name: str) -> dict[str, Any]:
-    """One model's row."""
+def measure(options: Options, variant: str, seed: int, maze_name: str) -> Row:
+    """The row of one model."""
     run = (options.runs or Path("runs") / options.robot) / f"{variant}-{seed}"
     model, maze = load_model(str(run)), load_maze(maze_name)
     env = MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
@@ -60,28 +57,36 @@ def measure(options: Options, variant: str, seed: int, maze_name: str) -> dict[s
     pairs = draw_pairs(PAIRS_SEED, maze, options.pairs, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
     with Bar(f"{run.name} in {maze_name}", options.pairs) as bar:
         episodes = evaluate(
-            env, maze, pairs, "ct", policy=model.policy,
+            env, maze, pairs, CT, policy=model.policy,
             on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
         )  # fmt: skip
     head = {
-        "robot": model.robot, "variant": variant, "method": "ct", "maze": maze_name, "seen": False, "model_seed": seed,
-        "episodes": options.pairs, "seed": PAIRS_SEED, "controller": digest_of(model.controller),
+        "robot": model.robot, "variant": variant, "method": CT, "maze": maze_name, "seen": False, "model_seed": seed,
+        "episodes": options.pairs, "seed": PAIRS_SEED, "controller": digest_arrays(model.controller),
+        "outcomes": {"success": as_digits(episodes.success)}, "trained": origin_of(model.made),
     }  # fmt: skip
-    outcomes = {"success": "".join("01"[int(success)] for success in episodes.success)}
-    return head | episodes.summary() | {"outcomes": outcomes} | origin(provenance()) | {"trained": origin(model.made)}
+    return Row.read(head | episodes.summary() | origin_of(provenance()))
+
+
+def before_of(options: Options) -> str:
+    """The variant to compare with. Raises UserError where ``--tuned`` names none that was fine-tuned."""
+    tuned = {name: variant.tuned_from for name, variant in load_variants(options.robot).items() if variant.tuned_from}
+    if options.tuned not in tuned:
+        raise UserError(f"--tuned {options.tuned}: no fine-tuned variant; give one of {', '.join(tuned)}")
+    return LONGER if options.longer else tuned[options.tuned]
 
 
 def main(options: Options) -> None:
-    """Measure all, seed by seed and maze by maze, and write each down as it is there."""
+    """Measure all, seed by seed and maze by maze; each pair of rows is written down as soon as it is measured."""
     prepare_jax()
+    variants = (before_of(options), options.tuned)
     for seed in options.seeds:
         for maze in options.maze:
-            variants = (LONGER if options.longer else untuned(options.tuned), options.tuned)
             before, after = (measure(options, variant, seed, maze) for variant in variants)
-            if before["controller"] != after["controller"]:
-                raise UserError(f"the models of seed {seed} were led by different controllers")
-            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"))
-            print_rows([row | {"method": row["variant"]} for row in (before, after)])
+            if before.controller != after.controller:
+                raise UserError(f"the models of seed {seed} have different low-level controllers; train both anew")
+            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"), Row)
+            print_rows([row.values() | {"method": row.variant} for row in (before, after)])
 
 
 if __name__ == "__main__":

@@ -3,15 +3,63 @@
 
     python experiments/humanoid.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--controller own|zoo]
 
-With ``--preset cpu`` each row of the paper's table is trained at the CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and what lifts it without and with fine-tuning; planner and explorer stand
-beside them. All of them meet the same 100 start-goal pairs. A controller of one's own takes hours of a core and can be
-interrupted at any time; ``--controller RUN`` takes that of a run. Writes ``experiments/results/humanoid-PRESET.json``.
+With ``--preset cpu`` every row of the paper's table is trained at a CPU's size on 1000 guided trajectories: CT as
+published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. A planner and an
+explorer stand beside them. All methods meet the same 100 start-goal pairs. A low-level controller of your own takes
+hours on one core and can be interrupted at any time; ``--controller zoo`` takes the shipped one. ``zoo:humanoid`` is
+``cpu``. Writes ``experiments/results/humanoid-PRESET.json``.
 """
 
-from _variants import experiment
+from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
-from ct_jax.cli import leave
+BC = {"model.returns": False}
+F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 60, "round_fit": half_the_updates}
+# Without fine-tuning: the updates of the last training at once, its timesteps shifted at random.
+CT = {"rounds": 0, "fit.updates": 2500, "fit.warmup": 20, "fit.decay": True, "fit.shift_timestep": 300}
+LONG_CT = CT | {"fit.updates": 5000}
+LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
+MODES_CT = CT | {"model.modes": 4}
+MODES = {"model.modes": 4, "model.commitment": 3.0}  # Only who has learned from failures keeps to a mode.
+CALM = {"controller_effort": 0.75}  # of the controller's range
+MEMORY = {"model.stride": 4}  # as many steps remembered, farther apart
+ROAM = {"recover.random_mazes": 100}  # CT of the one maze, which looks for its failures in others
+# Trajectories and recoveries of 100 random mazes besides; CT and F-CT after as many updates in all.
+MAZES = {
+    "random_mazes": 100, "collect.trajectories": 2500, "collect.reset_interval": 10, "rounds": 6,
+    "fit.updates": 600, "fit.shift_timestep": 300, "round_fit.updates": 200, "round_fit.shift_timestep": 300,
+    "last_fit.updates": 2400, "last_fit.shift_timestep": 300,
+}  # fmt: skip
+MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
+
+SHIPPED = "cpu"  # the variant that zoo:humanoid is
+
+VARIANTS = {
+    "published": Variant("published", label="CT"),
+    "bc": Variant("published", BC, label="BC-CT"),
+    "f-ct": Variant("published", F_CT, label="F-CT", tuned_from="published"),
+    "pt-cql": Variant("published", label="PT-CQL", baseline=pt_cql_config("heading")),
+    "sac": Variant("published", label="SAC alone", baseline=sac_alone_config("humanoid")),
+    "cpu-ct": Variant("cpu", CT),
+    "cpu": Variant("cpu", tuned_from="cpu-ct"),
+    "mazes-ct": Variant("cpu", MAZES_CT),
+    "mazes": Variant("cpu", MAZES, tuned_from="mazes-ct"),
+    "modes-ct": Variant("cpu", MODES_CT),
+    "modes": Variant("cpu", MODES, tuned_from="modes-ct"),
+    "calm-ct": Variant("cpu", CT | CALM),
+    "calm": Variant("cpu", CALM, tuned_from="calm-ct"),
+    "memory-ct": Variant("cpu", CT | MEMORY),
+    "memory": Variant("cpu", MEMORY, tuned_from="memory-ct"),
+    "calm+memory-ct": Variant("cpu", CT | CALM | MEMORY),
+    "calm+memory": Variant("cpu", CALM | MEMORY, tuned_from="calm+memory-ct"),
+    "long-ct": Variant("cpu", LONG_CT),
+    "long": Variant("cpu", LONG, tuned_from="long-ct"),
+    "calm+long-ct": Variant("cpu", LONG_CT | CALM),
+    "calm+long": Variant("cpu", LONG | CALM, tuned_from="calm+long-ct"),
+    "roam": Variant("cpu", ROAM, tuned_from="cpu-ct"),
+    "modes+roam": Variant("cpu", MODES | ROAM, tuned_from="modes-ct"),
+    "modes+memory-ct": Variant("cpu", MODES_CT | MEMORY),
+    "modes+memory+roam": Variant("cpu", MODES | MEMORY | ROAM, tuned_from="modes+memory-ct"),
+}
 
 if __name__ == "__main__":
-    leave(experiment("humanoid", __doc__))
+    main("humanoid", VARIANTS, __doc__)

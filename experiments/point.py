@@ -2,15 +2,67 @@
 
     python experiments/point.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--variants published cpu]
 
-With ``--preset cpu`` each row of the paper's table is trained at the CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and what lifts it without (``cpu-ct``) and with fine-tuning (``cpu``);
-planner and explorer stand beside them. All of them meet the same 100 start-goal pairs. ``zoo:point`` is ``mazes-ct``,
-with trajectories of 100 random mazes besides. Writes ``experiments/results/point-PRESET.json``.
+With ``--preset cpu`` every row of the paper's table is trained at a CPU's size on 1000 guided trajectories: CT as
+published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without (``cpu-ct``) and with fine-tuning
+(``cpu``). A planner and an explorer stand beside them. All methods meet the same 100 start-goal pairs. ``zoo:point``
+is ``mazes-ct``. Writes ``experiments/results/point-PRESET.json``.
 """
 
-from _variants import experiment
+from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
-from ct_jax.cli import leave
+BC = {"model.returns": False}
+F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 20, "round_fit": half_the_updates}
+# Without fine-tuning: the updates of the last training at once, its timesteps shifted at random.
+CT = {"rounds": 0, "fit.updates": 2500, "fit.warmup": 20, "fit.decay": True, "fit.shift_timestep": 300}
+LONG_CT = CT | {"fit.updates": 5000}
+LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
+MODES_CT = CT | {"model.modes": 4}
+MODES = {"model.modes": 4, "model.commitment": 3.0}  # Only who has learned from failures keeps to a mode.
+CALM = {"controller_effort": 0.75}  # of the controller's range
+MEMORY = {"model.stride": 3}  # as many steps remembered, farther apart
+SKILL = {"model.skill": True}  # the head is the low-level controller, as it was learned
+ROAM = {"recover.random_mazes": 100}  # CT of the one maze, which looks for its failures in others
+# Trajectories and recoveries of 100 random mazes besides; CT and F-CT after as many updates in all.
+MAZES = {
+    "random_mazes": 100, "collect.trajectories": 2500, "collect.reset_interval": 10, "rounds": 6,
+    "fit.updates": 600, "fit.shift_timestep": 300, "round_fit.updates": 200, "round_fit.shift_timestep": 300,
+    "last_fit.updates": 2400, "last_fit.shift_timestep": 300,
+}  # fmt: skip
+MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
+
+SHIPPED = "mazes-ct"  # the variant that zoo:point is
+
+VARIANTS = {
+    "published": Variant("published", label="CT"),
+    "bc": Variant("published", BC, label="BC-CT"),
+    "f-ct": Variant("published", F_CT, label="F-CT", tuned_from="published"),
+    "pt-cql": Variant("published", label="PT-CQL", baseline=pt_cql_config()),
+    "sac": Variant("published", label="SAC alone", baseline=sac_alone_config("point")),
+    "cpu-ct": Variant("cpu", CT),
+    "cpu": Variant("cpu", tuned_from="cpu-ct"),
+    "mazes-ct": Variant("cpu", MAZES_CT),
+    "mazes": Variant("cpu", MAZES, tuned_from="mazes-ct"),
+    "modes-ct": Variant("cpu", MODES_CT),
+    "modes": Variant("cpu", MODES, tuned_from="modes-ct"),
+    "calm-ct": Variant("cpu", CT | CALM),
+    "calm": Variant("cpu", CALM, tuned_from="calm-ct"),
+    "memory-ct": Variant("cpu", CT | MEMORY),
+    "memory": Variant("cpu", MEMORY, tuned_from="memory-ct"),
+    "skill-ct": Variant("cpu", CT | SKILL),
+    "skill": Variant("cpu", SKILL, tuned_from="skill-ct"),
+    "calm+memory-ct": Variant("cpu", CT | CALM | MEMORY),
+    "calm+memory": Variant("cpu", CALM | MEMORY, tuned_from="calm+memory-ct"),
+    "calm+memory+skill-ct": Variant("cpu", CT | CALM | MEMORY | SKILL),
+    "calm+memory+skill": Variant("cpu", CALM | MEMORY | SKILL, tuned_from="calm+memory+skill-ct"),
+    "long-ct": Variant("cpu", LONG_CT),
+    "long": Variant("cpu", LONG, tuned_from="long-ct"),
+    "calm+long-ct": Variant("cpu", LONG_CT | CALM),
+    "calm+long": Variant("cpu", LONG | CALM, tuned_from="calm+long-ct"),
+    "roam": Variant("cpu", ROAM, tuned_from="cpu-ct"),
+    "modes+roam": Variant("cpu", MODES | ROAM, tuned_from="modes-ct"),
+    "modes+memory-ct": Variant("cpu", MODES_CT | MEMORY),
+    "modes+memory+roam": Variant("cpu", MODES | MEMORY | ROAM, tuned_from="modes+memory-ct"),
+}
 
 if __name__ == "__main__":
-    leave(experiment("point", __doc__))
+    main("point", VARIANTS, __doc__)

@@ -1,25 +1,22 @@
-"""Transfer between the point robot and the ant (the paper's figure): success against updates, with and without.
+"""Transfer between the point robot and the ant (paper, sec. IV-A, its figure): success against updates.
 
     python experiments/transfer.py [--robots ant point] [--point runs/point/cpu-0] [--ant runs/ant/cpu-0]
 
 Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
 transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
-robot's model (``ct_jax.transfer``), and tried on the run's pairs in the unseen maze as training goes on. Writes
-``experiments/results/transfer.json``, in which curves of other runs and seeds stay, and ``docs/transfer.png``.
+robot's model (``ct_jax.transfer``). As training goes on, it is evaluated in the unseen maze. Writes
+``experiments/results/transfer.json``, in which the curves of other runs and seeds stay.
 """
 
 import functools
 from dataclasses import dataclass, replace
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import tyro
-from _variants import claim, digest_of, origin, replace_rows
-from matplotlib.figure import Figure
-from table import start_of
+from rows import CT, RESULTS, TransferRow, origin_of, replace_rows
+from study import claim, digest_arrays
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
 from ct_envs.maze import make_maze, parse_walls
@@ -35,8 +32,7 @@ from ct_jax.run import provenance, random_mazes
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
 
-RESULTS = Path(__file__).parent / "results" / "transfer.json"
-PICTURE = Path(__file__).parents[1] / "docs" / "transfer.png"
+FILE = RESULTS / "transfer.json"
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,9 @@ class Target:
         return Target(model, data, env, learner, mazes, next(iter(unseen.items())))
 
 
-def curve(target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path) -> list[dict]:
+def curve(
+    target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path
+) -> list[dict[str, Any]]:
     """Success after each number of updates, from a source's trunk or from scratch; resumable."""
     init_key, fit_key = jax.random.split(jax.random.key(seed))
     policy = target.model.policy
@@ -110,16 +108,16 @@ def curve(target: Target, source: TrainedModel | None, seed: int, options: Optio
                     fit_key, target.learner, params, target.data, target.mazes, updates=mark, checkpoints=checkpoints,
                     on_progress=lambda update, loss: bar.update(update, f"loss {loss:.4f}"),
                 )  # fmt: skip
-                episodes = evaluate(target.env, maze, pairs, "ct", policy=replace(policy, params=params_now))
+                episodes = evaluate(target.env, maze, pairs, CT, policy=replace(policy, params=params_now))
                 row = {"updates": mark, "maze": name, "episodes": options.episodes} | episodes.summary()
-                write_json(file, row | origin(made))
+                write_json(file, row | origin_of(made))
             rows.append(read_json(file))
     checkpoints.close()
     return rows
 
 
-def measure(options: Options) -> list[dict[str, Any]]:
-    """All curves' rows."""
+def measure(options: Options) -> list[TransferRow]:
+    """The rows of all curves."""
     runs, others = {"point": options.point, "ant": options.ant}, {"point": "ant", "ant": "point"}
     for robot in options.robots:
         if robot not in runs:
@@ -137,47 +135,19 @@ def measure(options: Options) -> list[dict[str, Any]]:
                 models = [make(robot).model, *([source] if source else [])]
                 # A fit goes on from the mark before: another mark among them would find a later one's weights.
                 of = {
-                    "models": [digest_of(model.policy.params) for model in models],
+                    "models": [digest_arrays(model.policy.params) for model in models],
                     "episodes": options.episodes, "marks": sorted(options.marks),
                 }  # fmt: skip
                 claim(folder / "curve.json", of, "runs, pairs or marks")
-                rows += [head | row for row in curve(make(robot), source, seed, options, folder)]
+                rows += [TransferRow.read(head | row) for row in curve(make(robot), source, seed, options, folder)]
     return rows
-
-
-def draw(rows: list[dict[str, Any]], file: Path) -> None:
-    """Success against updates: means over seeds, and their range."""
-    subjects = list(dict.fromkeys((row["robot"], row["run"]) for row in rows))
-    figure = Figure((4.0 * len(subjects), 3.2), layout="constrained")
-    axes = figure.subplots(1, len(subjects), sharey=True, squeeze=False)[0]
-    for ax, subject in zip(axes, subjects, strict=True):
-        mine = [row for row in rows if (row["robot"], row["run"]) == subject]
-        for start, colour in zip(sorted({*map(start_of, mine)}), cycle(("#c8400e", "#1b6ca8", "#3a7d44"))):
-            rates: dict[int, list[float]] = {}
-            for row in mine:
-                if start_of(row) == start:
-                    rates.setdefault(row["updates"], []).append(100 * row["success_rate"])
-            at = sorted(rates)
-            ax.plot(at, [np.mean(rates[mark]) for mark in at], marker="o", color=colour, label=start)
-            ax.fill_between(
-                at, [min(rates[mark]) for mark in at], [max(rates[mark]) for mark in at], color=colour, alpha=0.15
-            )
-        marks = sorted({row["updates"] for row in mine})
-        ax.set(title=", ".join(subject), xlabel="updates", xscale="log", ylim=(0, 100))
-        ax.set_xticks(marks, map(str, marks))
-        ax.minorticks_off()
-        ax.legend(loc="best", frameon=False)
-    axes[0].set_ylabel("success in the unseen maze [%]")
-    figure.savefig(file, dpi=150)
 
 
 def main(options: Options) -> None:
     """Run the experiment."""
     prepare_jax()
-    rows = measure(options)
-    RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    draw(replace_rows(RESULTS, rows, ("robot", "run", "start", "source", "seed", "updates")), PICTURE)
-    print(f"results: {RESULTS}\npicture: {PICTURE}")
+    replace_rows(FILE, measure(options), ("robot", "run", "start", "source", "seed", "updates"), TransferRow)
+    print(f"results: {FILE}\npages:   python experiments/pages.py writes them to docs/results")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,466 @@
+"""Runs a robot's variants: each a preset with plain overrides, trained and evaluated with each seed.
+
+A run that is finished is taken as it is; one that was interrupted goes on. Runs share the stages that come out alike:
+a stage is known by the digest of its inputs.
+"""
+
+import functools
+import hashlib
+import importlib
+import json
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rows import CT, RESULTS, Results, Row, Unmade, add_results, origin_of
+
+from ct_envs import UserError
+from ct_jax import pipeline
+from ct_jax import trajectories as storage
+from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
+from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
+from ct_jax.baselines.sac_alone import EDGES_ONLY, train_sac_alone
+from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.cli import guarded, leave, prepare_jax, print_rows
+from ct_jax.controllers.sac import SacConfig
+from ct_jax.evaluate import GUIDED
+from ct_jax.finetune import NoRecoveryError
+from ct_jax.mazes import evaluated
+from ct_jax.model import load_controller
+from ct_jax.presets import Settings, get_preset, to_dict
+from ct_jax.progress import Metrics
+from ct_jax.run import (
+    Run,
+    default_mazes,
+    episodes_file,
+    identity,
+    join_mazes,
+    load_mazes,
+    open_run,
+    provenance,
+    training,
+)
+
+SAC_ALONE_ITERATIONS = 8000  # of the point: 500 whole episodes
+
+
+# -------------------------------------------------------------------------------------------------------- variants
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A row of a robot's table: a preset, and what is different."""
+
+    preset: str
+    """"published" (at the size that --preset names) or "cpu"."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Settings by dotted name, such as "model.modes"; a function gives the value from the preset."""
+    label: str = ""
+    """What tables call it (default: CT or F-CT with the variant's name)."""
+    tuned_from: str | None = None
+    """Of a fine-tuned variant: the variant that it was before."""
+    baseline: CqlConfig | SacConfig | None = None
+    """What is learned from the run's data, or instead of it, in place of a transformer."""
+    sweeps: tuple[str, ...] = ()
+    """Turtlebot3: what else it meets: "density", "noise", "seven"."""
+
+    def settings(self, robot: str, preset: str = "cpu") -> Settings:
+        """The settings of its runs, with ``--preset preset``."""
+        size = "published" if preset == "cpu" else preset
+        base = get_preset(size if self.preset == "published" else self.preset, robot)
+        settings = base
+        for name, value in self.changes.items():
+            settings = _set(settings, name.split("."), value(base) if callable(value) else value)
+        return settings
+
+
+def _set(config: Any, path: list[str], value: Any) -> Any:
+    """A frozen dataclass with another value at a path of field names."""
+    name, *below = path
+    return replace(config, **{name: _set(getattr(config, name), below, value) if below else value})
+
+
+def half_the_updates(published: Settings) -> Any:
+    """The training after fine-tuning as published, whose length the paper does not give: half of the first one."""
+    return replace(published.fit, updates=published.fit.updates // 2, warmup=20)
+
+
+def pt_cql_config(frame: str = "world") -> CqlConfig:
+    """PT-CQL's settings, chosen by ``experiments/cql.py``."""
+    return CqlConfig(updates=2500, mirror=True, frame=frame)
+
+
+def sac_alone_config(robot: str) -> SacConfig:
+    """SAC alone: the controller's learner with the maze as its task: longer ways need a longer view."""
+    sac = get_preset("cpu", robot).sac
+    changes = {"discount": 0.99, "iterations": SAC_ALONE_ITERATIONS, "reward_scale": 0.1, "alive_bonus": 0.0}
+    return replace(sac, **changes, **EDGES_ONLY)
+
+
+def load_variants(robot: str) -> dict[str, Variant]:
+    """The variants that a robot's file holds. Raises UserError for a robot without one."""
+    if robot not in ROBOTS:
+        raise UserError(f"no experiment for robot '{robot}'; robots: {', '.join(ROBOTS)}")
+    return importlib.import_module(robot).VARIANTS
+
+
+ROBOTS = ("point", "ant", "humanoid", "turtlebot3")
+
+
+def choose(variants: Mapping[str, Variant], preset: str, names: tuple[str, ...] = ()) -> dict[str, Variant]:
+    """The variants that a preset has, or those of them that are named, each after those whose stages it shares.
+
+    "cpu" has all; "published" and "paper" have the published ones, at their size; "demo" is one of its own.
+
+    Raises:
+        UserError: a variant that the preset does not have.
+    """
+    known = dict(variants)
+    if preset == "demo":
+        known = {preset: Variant(preset)}
+    elif preset != "cpu":
+        known = {name: variant for name, variant in variants.items() if variant.preset == "published"}
+    for name in names:
+        if name not in known:
+            raise UserError(f"no variant named '{name}' with preset '{preset}'; variants: {', '.join(known)}")
+    return {name: variant for name, variant in known.items() if not names or name in names}
+
+
+# ---------------------------------------------------------------------------------------------------- command line
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    preset: str = "cpu"
+    """demo, cpu, published or paper."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the trained models."""
+    variants: tuple[str, ...] = ()
+    """Rows to run (default: all that the preset has)."""
+    out: Path | None = None
+    """Folder of the runs (default: runs/ROBOT); what is finished there is not run again."""
+
+
+@dataclass(frozen=True)
+class MazeOptions(Options):
+    """What to run in mazes."""
+
+    controller: str = "own"
+    """Low-level controller: own, zoo, or a run folder."""
+    engine: str = "auto"
+    """Physics: auto, mjx or mujoco."""
+
+
+def about(docstring: str | None, variants: Mapping[str, Variant]) -> str:
+    """What --help says of an experiment."""
+    return f"{docstring}\nvariants: {', '.join(variants)}"
+
+
+def main(robot: str, variants: Mapping[str, Variant], docstring: str | None) -> NoReturn:
+    """The command line of a maze robot's experiment."""
+
+    def run() -> None:
+        options = tyro.cli(MazeOptions, description=about(docstring, variants))
+        file = RESULTS / f"{robot}-{options.preset}.json"
+        study = Study(
+            robot=robot, preset=options.preset, out=options.out or Path("runs") / robot, engine=options.engine,
+            controller=options.controller,
+        )  # fmt: skip
+        study.run(
+            choose(variants, options.preset, options.variants), options.seeds, lambda found: add_results(file, found)
+        )
+        show_results(file)
+
+    leave(guarded(run))
+
+
+def show_results(file: Path) -> None:
+    """Print the rows of a results file."""
+    print_rows([row.values() | {"method": f"{row.variant}: {row.method}"} for row in Results.read(file).rows])
+    print(f"results: {file}\npages:   python experiments/pages.py writes them to docs/results")
+
+
+# ----------------------------------------------------------------------------------------------------------- study
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs of one robot in one folder."""
+
+    robot: str
+    preset: str
+    out: Path
+    engine: str = "auto"
+    controller: str = "own"
+
+    def make_run(self, name: str, variant: Variant, seed: int) -> Run:
+        """The run of a variant and a seed."""
+        seen, unseen = default_mazes(self.robot)
+        settings = replace(variant.settings(self.robot, self.preset), controller=self.controller)
+        return Run(
+            folder=self.out / f"{name}-{seed}", robot=self.robot, preset=self.preset, settings=settings,
+            mazes=load_mazes(seen), eval_mazes=load_mazes(unseen), seed=seed, engine=self.engine,
+        )  # fmt: skip
+
+    def run(self, variants: Mapping[str, Variant], seeds: tuple[int, ...], keep: Callable[[Results], None]) -> Results:
+        """Train and evaluate all variants with each seed; a failure of one stops no other.
+
+        F-CT that finds nothing to learn from is a result, too: its reason is kept instead of a row. Planner and
+        explorer appear once for each roadmap margin and each effort.
+
+        Args:
+            keep: called with all results so far after each model.
+
+        Raises:
+            UserError: after all others have run: the runs that could not be finished.
+        """
+        prepare_jax()
+        found, failed = Results(), []
+        runs: list[Run] = []
+        for seed in seeds:
+            for name, variant in variants.items():
+                run = self.make_run(name, variant, seed)
+                print(f"== {self.robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
+                try:
+                    share(runs, run)
+                    rows = measure(run, name, variant)
+                except NoRecoveryError as none:
+                    print(f"{run.folder}: {none}", file=sys.stderr)
+                    found.unmade.append(Unmade(**made_of(run, name, CT), why=str(none)))
+                    keep(found)
+                    continue
+                except UserError as bad:  # the others may yet come out
+                    print(f"{run.folder}: {bad}", file=sys.stderr)
+                    failed.append(f"{run.folder}: {bad}")
+                    continue
+                if reference(run) in map(reference, runs):
+                    rows = [row for row in rows if row.method not in GUIDED]
+                found.rows += rows
+                runs.append(run)
+                keep(found)
+        if failed:
+            raise UserError("; ".join(failed))
+        return found
+
+
+def measure(run: Run, name: str, variant: Variant) -> list[Row]:
+    """The rows of a run, which is trained or learned unless it is finished."""
+    if variant.baseline is not None:
+        found = BASELINES[type(variant.baseline)](run, variant.baseline)
+    else:
+        pipeline.train(run, resume=True)
+        found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
+    return [label(run, name, values) for values in found]
+
+
+def reference(run: Run) -> dict[str, float]:
+    """What tells the planner and the explorer of a run from those of other runs; in rooms they never differ."""
+    settings = run.settings
+    if settings.rooms:
+        return {}
+    effort = {"effort": settings.controller_effort} if settings.controller_effort != 1.0 else {}
+    return {"margin_m": settings.prm.margin_m} | effort
+
+
+# ---------------------------------------------------------------------------------------------------------- stages
+
+# The settings that a stage depends on, besides those of the stage before it.
+STAGES = {
+    "controller": ("prm", "controller", "sac"),
+    "collect": ("controller_effort", "collect", "rooms", "random_mazes"),
+    "fit": ("model", "fit", "value"),
+}
+_REFERENCES = ("episodes", "pairs_seed", "controller_effort")
+
+
+def stage_digests(run: Run) -> dict[str, str]:
+    """Digests of the inputs of each stage that runs may share; "evaluate" is that of planner and explorer."""
+    found = identity(run)
+    settings: dict[str, Any] = found["settings"]
+    where = {name: found[name] for name in ("robot", "mazes", "eval_mazes", "engine")}
+    inputs: dict[str, Any] = {"seed": run.seed, "where": where}
+    digests: dict[str, str] = {}
+    for stage, names in STAGES.items():
+        inputs |= {name: settings.get(name) for name in names}
+        digests[stage] = digest_words(inputs)
+    asked = {name: settings.get(name) for name in _REFERENCES}
+    if run.settings.rooms:  # where they have a roadmap and a controller of their own
+        asked = {name: asked[name] for name in ("episodes", "pairs_seed")} | {"worlds": run.settings.rooms.worlds}
+    else:
+        asked["controller"] = digests["controller"]
+    digests["evaluate"] = digest_words(asked | where)
+    return digests
+
+
+def share(runs: list[Run], run: Run) -> None:
+    """Copy the finished stages of other runs whose inputs are the same, with the episodes of planner and explorer."""
+    wanted = stage_digests(run)
+    with open_run(run, resume=True):
+        for source in runs:
+            have = stage_digests(source)
+            for stage in (stage for stage in wanted if have[stage] == wanted[stage]):
+                if source.done(stage) is None or (run.folder / stage).exists():
+                    continue
+                if stage == "evaluate":
+                    _copy_references(source.folder / stage, run.folder / stage)
+                else:
+                    shutil.copytree(source.folder / stage, run.folder / stage)
+
+
+def _copy_references(source: Path, folder: Path) -> None:
+    folder.mkdir()
+    for ending in ("npz", "json"):  # of each row the JSON file comes last: it says that the row is whole
+        for method in GUIDED:
+            for file in source.glob(f"*-{method}.{ending}"):
+                shutil.copy(file, folder)
+
+
+# ------------------------------------------------------------------------------------------------------------ rows
+
+
+def label(run: Run, variant: str, values: dict[str, Any]) -> Row:
+    """A row with what made its model, or, where it says so itself, with what measured it later."""
+    made = made_of(run, variant, values["method"])
+    return Row.read(made | (reference(run) if values["method"] in GUIDED else {}) | values)
+
+
+def made_of(run: Run, variant: str, method: str) -> dict[str, Any]:
+    """The values of ``rows.Made``."""
+    config = read_json(run.folder / "config.json")
+    stages = [*sorted(run.folder.glob("*/done.json")), run.folder / "baselines" / method / "done.json"]
+    walls = {done.parent.name: read_json(done)["wall_s"] for done in stages if done.is_file()}
+    made = {"variant": variant, "model_seed": run.seed, "method": method, "settings": digest(run.settings)}
+    if not run.settings.rooms and method != "sac":  # which nothing led
+        made["controller"] = controller_digest(str(run.folder), run.robot)
+    made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
+    if method in walls:
+        made["learn_wall_s"] = round(walls[method])
+    return made | origin_of(config)
+
+
+@functools.cache  # every row of a run needs it
+def controller_digest(where: str, robot: str) -> str:
+    """Letters that tell low-level controllers apart, each of a run's folder."""
+    return digest_arrays(load_controller(where, robot)[0])
+
+
+def digest_arrays(tree: Any) -> str:
+    """Letters that tell trees of arrays apart."""
+    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))).hexdigest()[:12]
+
+
+def digest_words(*values: Any) -> str:
+    """Letters that tell values apart that JSON can hold."""
+    words = "".join(json.dumps(value, sort_keys=True) for value in values)
+    return hashlib.sha256(words.encode()).hexdigest()[:12]
+
+
+def digest(settings: Settings, baseline: CqlConfig | SacConfig | None = None) -> str:
+    """Letters that tell settings apart, with those of a baseline."""
+    return digest_words(to_dict(settings), *([asdict(baseline)] if baseline else []))
+
+
+def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, dict[str, str]]:
+    """What a row's rates count, episode by episode, as ones and zeros: methods are compared pair by pair."""
+    names = {"success": "success", "collision": "collided", "fall": "fell", "frontal": "frontal", "grazing": "grazing"}
+    with np.load(episodes_file(folder, row["maze"], row["method"])) as episodes:
+        found = {name: episodes[array] for name, array in names.items() if array in episodes}
+    return {"outcomes": {name: as_digits(flags) for name, flags in found.items()}}
+
+
+def as_digits(flags: np.ndarray) -> str:
+    """Booleans as ones and zeros."""
+    return "".join("01"[int(flag)] for flag in flags)
+
+
+def keep_once(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a file holds; measured, and written with its origin, where it is not there."""
+    if not file.is_file():
+        write_json(file, measure() | origin_of(provenance()))
+    return read_json(file)
+
+
+def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
+    """Write down what the results in a file's folder are made from; returns the origin of the first writer.
+
+    Args:
+        what: the word for the inputs.
+
+    Raises:
+        UserError: the results there are made from something else.
+    """
+    inputs = json.loads(json.dumps(inputs, default=str))  # tuples as lists, as they are read back
+    if not file.is_file():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(file, {"of": inputs} | origin_of(provenance()))
+    before = read_json(file)
+    if before.get("of") != inputs:
+        raise UserError(f"{file.parent}: was made with other {what}; delete it, and it is made anew")
+    return origin_of(before)
+
+
+# ------------------------------------------------------------------------------------------------------- baselines
+
+
+def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
+    """Rows of PT-CQL, learned from the run's planning trajectories, which are collected where they are missing."""
+    with open_run(run, resume=True):
+        course, metrics = pipeline.COURSES[run.spec.course](run), Metrics(run.folder)
+        controller, _ = course.controller(metrics)
+        metrics.close()
+        pipeline.planning_trajectories(run, course, controller)
+
+    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
+        data = storage.load(run.folder / "collect" / "trajectories.npz")
+        learner = Cql(config, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
+        return train_cql(key, learner, data, run.stacked, **watch)
+
+    return baseline(run, name, learn, config, config.updates, config.width)
+
+
+def sac_alone(run: Run, config: SacConfig) -> list[dict[str, Any]]:
+    """Rows of SAC alone in the run's maze, without its data."""
+
+    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
+        return train_sac_alone(key, run.env, next(iter(run.mazes.values())), config, **watch)
+
+    return baseline(run, "sac", learn, config, config.iterations, config.hidden[0])
+
+
+BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: pt_cql, SacConfig: sac_alone}
+
+
+def baseline(
+    run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
+) -> list[dict[str, Any]]:
+    """Rows of one baseline, learned unless its weights are there."""
+    frame, stage = config.frame, f"baselines/{name}"
+    folder = run.folder / stage
+    env = run.env(auto_reset=False)
+    actor = Actor(env.action_size, width, frame)
+    params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
+    policy = ActorPolicy(params, env.action_size, width, frame)
+    file = folder / "weights.safetensors"
+    with open_run(run, resume=True):
+        (run.folder / "evaluate").mkdir(exist_ok=True)  # for the pairs
+        made = claim(folder / "baseline.json", asdict(config), "settings")
+        if run.done(stage) is None:
+            with run.stage(stage):
+                metrics = Metrics(folder)
+                with training(folder, name, total, metrics) as watch:
+                    learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
+                metrics.close()
+                save_weights(file, learned.params)
+        policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
+        mazes = join_mazes(run.mazes, run.eval_mazes).items()
+        rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+    return [made | {"settings": digest(run.settings, config)} | row | outcomes(folder, row) for row in rows]
