@@ -74,7 +74,6 @@ class ModelConfig(Checked):
         return 3 if self.actions else 2
 
 
-_RECORDED = ("map", "proprio", "goal", "action", "rtg")  # of each step, in the order of ``ControlTransformer.propose``
 _NEVER = -(10**6)  # the step of a token that is not there
 
 
@@ -414,15 +413,16 @@ class ControlTransformer(nn.Module):
             return jax.lax.dynamic_update_index_in_dim(jnp.roll(kept, -shift, axis=1), new, place, 1)
 
         blank = jnp.zeros_like(history.action[:, 0])
-        new = (maps, proprio, goal, blank, rtg)
-        window = [put(getattr(history, name), value) for name, value in zip(_RECORDED, new, strict=True)]
+        seen = history.replace(
+            map=put(history.map, maps), proprio=put(history.proprio, proprio), goal=put(history.goal, goal),
+            action=put(history.action, blank), rtg=put(history.rtg, rtg), now=history.now + 1,
+        )  # fmt: skip
         order = jnp.arange(places)
-        timestep = jnp.broadcast_to(history.now - place + order, history.rtg.shape)
-        valid = jnp.broadcast_to((order <= place).astype(jnp.float32), history.rtg.shape)
-        modes = self.propose(*window, timestep, valid, context=places)
+        timestep = jnp.broadcast_to(history.now - place + order, rtg.shape + order.shape)
+        valid = jnp.broadcast_to((order <= place).astype(jnp.float32), timestep.shape)
+        modes = self.propose(seen.map, seen.proprio, seen.goal, seen.action, seen.rtg, timestep, valid, context=places)
         action = jnp.clip(jax.lax.dynamic_index_in_dim(modes.best(), place, 1, keepdims=False), -1.0, 1.0)
-        window[_RECORDED.index("action")] = jax.lax.dynamic_update_index_in_dim(window[3], action, place, 1)
-        return action, History(*window, history.now + 1)
+        return action, seen.replace(action=jax.lax.dynamic_update_index_in_dim(seen.action, action, place, 1))
 
 
 def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Array, "T M"]:
