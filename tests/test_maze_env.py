@@ -12,6 +12,7 @@ from brax.envs.wrappers.training import VmapWrapper
 
 from ct_envs import POINT, ROBOTS, MazeEnv, Tasks, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_envs.maze import load_walls, parse_walls
+from ct_envs.maze_env import check_tasks
 from ct_envs.occupancy import local_map
 
 N = 8
@@ -38,6 +39,12 @@ HORIZON = 4
 def far(tasks: Tasks) -> Tasks:
     """Only the last of three tasks."""
     return tasks.replace(start=jnp.tile(tasks.start[2:], (3, 1)), goal=jnp.tile(tasks.goal[2:], (3, 1)))
+
+
+def at_step(state, number: int):
+    """The state with its clocks set to that number of steps."""
+    steps = jnp.full_like(state.pipeline_state.episode_steps, number)
+    return state.replace(pipeline_state=state.pipeline_state.replace(episode_steps=steps))
 
 
 def keys(seed: int, n: int = N) -> jax.Array:
@@ -190,8 +197,6 @@ def test_actions_beyond_one_are_clipped():
     action = actions(6, 1)[0]
     assert (jnp.abs(action) > 1).any()
     assert_same(step(state, action), step(state, jnp.clip(action, -1, 1)))
-    inf = jnp.full_like(action, jnp.inf)
-    assert_same(step(state, inf), step(state, jnp.ones_like(action)))
 
 
 def test_collision_is_told_while_a_wall_is_touched(wall_distance):
@@ -200,7 +205,7 @@ def test_collision_is_told_while_a_wall_is_touched(wall_distance):
     state = reset(keys(7), LARGE, None)
     distances, told = [], []
     for _ in range(30):
-        state = step(state.replace(info=state.info | {"episode_steps": jnp.zeros(N, jnp.int32)}), jnp.ones((N, 2)))
+        state = step(at_step(state, 0), jnp.ones((N, 2)))
         distances.append(wall_distance(load_walls("antmaze-large"), state.info["position"]))
         told.append(np.asarray(state.info["collision"]))
     distance, told = np.stack(distances), np.stack(told) > 0
@@ -277,7 +282,7 @@ def test_every_auto_reset_draws_a_fresh_start_and_goal():
     step, state = compiled(horizon=HORIZON), reset(keys(12), LARGE, None)
     starts, goals = [state.info["position"]], [state.info["goal"]]
     for _ in range(6):
-        state = step(state.replace(info=state.info | {"episode_steps": jnp.full(N, HORIZON - 1)}), jnp.zeros((N, 2)))
+        state = step(at_step(state, HORIZON - 1), jnp.zeros((N, 2)))
         assert (state.done == 1).all()
         starts.append(state.info["position"])
         goals.append(state.info["goal"])
@@ -333,35 +338,117 @@ def test_without_auto_reset_a_finished_environment_stays_as_it_is():
 
 @pytest.mark.rank_promotion("allow")  # MJX
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("what", ["action", "state"])
-def test_a_nan_ends_its_episode_and_no_other(monkeypatch, tmp_path, engine, what):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
+def test_what_is_not_finite_ends_its_episode_and_no_other(monkeypatch, tmp_path, engine, bad, what):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning of a state there
     step, state, action = compiled(engine, horizon=HORIZON), reset(keys(17), LARGE, None), actions(17, 1)[0]
     clean = step(state, action)
     sick = np.arange(N) == 3
-    poison = lambda leaf: jnp.where(sick[:, None], jnp.nan, leaf)  # noqa: E731
+    poison = lambda leaf: jnp.where(sick[:, None], bad, leaf)  # noqa: E731
     if what == "action":
-        after = step(state, action.at[3, 1].set(jnp.nan))
-        assert np.isfinite(after.reward).all()
+        after = step(state, action.at[3, 1].set(bad))
+        assert np.isfinite(after.reward).all() and not [*tmp_path.iterdir()]
     else:
         physics = state.pipeline_state
         after = step(state.replace(pipeline_state=physics.replace(qvel=poison(physics.qvel))), action)
     others = np.flatnonzero(~sick)
     assert_same(*(jax.tree.map(lambda leaf: leaf[others], s) for s in (clean, after)))
     assert after.done[3] == 1 and after.info["success"][3] == 0 and after.info["truncation"][3] == 0
+    np.testing.assert_array_equal(after.info["diverged"], sick)
     for _ in range(HORIZON - 2):  # the next episode
         after = step(after, action)
-        assert (after.done == 0).all()
+        assert (after.done == 0).all() and (after.info["diverged"] == 0).all()
         jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), after.obs)
         assert np.isfinite(after.reward).all()
     assert after.info["episode_steps"][3] == HORIZON - 2 and after.info["episode_steps"][0] == HORIZON - 1
 
 
-def test_a_nan_action_without_auto_reset_leaves_a_finite_state(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_without_auto_reset_an_action_that_is_not_finite_leaves_the_robot_where_it_was(bad):
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(18), LARGE, None)
-    after = step(state, jnp.full((N, 2), jnp.nan))
-    assert (after.done == 1).all() and (after.info["success"] == 0).all()
-    assert_same(after.pipeline_state, state.pipeline_state)
+    after = step(state, jnp.full((N, 2), bad))
+    assert (after.done == 1).all() and (after.info["success"] == 0).all() and (after.info["diverged"] == 1).all()
+    for name in ("qpos", "qvel", "goal"):
+        np.testing.assert_array_equal(getattr(after.pipeline_state, name), getattr(state.pipeline_state, name))
     np.testing.assert_allclose(after.reward, -np.linalg.norm(state.obs["goal"], axis=-1), rtol=1e-5)
+
+
+# ------------------------------------------------------------------------------------- what cannot be an episode
+
+ENV = MazeEnv(POINT, engine="mujoco", maps=False)
+WRONG_SHAPES = [
+    {"start": jnp.ones(2)}, {"start": jnp.ones((2, 3, 2))}, {"goal": jnp.ones((2, 2))}, {"goal": jnp.ones((3, 3))},
+    {"start": jnp.ones((0, 2)), "goal": jnp.ones((0, 2))}, {"n": jnp.ones(3, jnp.int32)}, {"n": jnp.array(3.0)},
+    {"follow": jnp.zeros((2, 1), jnp.int32)}, {"follow": jnp.zeros((3, 0), jnp.int32)},
+    {"follow": jnp.zeros(3, jnp.int32)}, {"follow": jnp.zeros((3, 1))}, {"turn_rad": jnp.zeros(3)},
+]  # fmt: skip
+FOLLOWED = {"n": jnp.array(1), "follow": jnp.array([[0], [0], [0]])}
+WRONG_VALUES = [
+    ({"start": NEAR.start.at[1].set(2.0)}, r"start\[1\] is \(2, 2\)"),  # in a wall
+    ({"start": NEAR.start.at[2].set(-6.0)}, r"start\[2\]"), ({"start": NEAR.start.at[0].set(1e30)}, r"start\[0\]"),
+    ({"goal": NEAR.goal.at[1, 0].set(jnp.nan)}, r"goal\[1\]"), ({"goal": NEAR.goal.at[1].set(-jnp.inf)}, r"goal\[1\]"),
+    ({"goal": NEAR.goal.at[2].set(jnp.array([10.0, 10.0]))}, r"goal\[2\]"), ({"n": jnp.array(0)}, "n is 0"),
+    ({"n": jnp.array(4)}, "n is 4"), ({"follow": jnp.array([[0], [3], [0]])}, "entry 3"),
+    ({"follow": jnp.array([[0], [-1], [0]])}, "entry -1"), ({"turn_rad": jnp.array(jnp.nan)}, "turn_rad"),
+    (FOLLOWED | {"start": NEAR.start.at[0].set(2.0)}, r"start\[0\]"),
+    (FOLLOWED | {"follow": jnp.array([[2], [0], [0]]), "goal": NEAR.goal.at[2].set(2.0)}, r"goal\[2\]"),
+]  # fmt: skip
+
+
+def assert_one_line(call, match: str) -> None:
+    with pytest.raises(UserError, match=match) as refused:
+        call()
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("change", WRONG_SHAPES, ids=lambda change: " ".join(change))
+def test_tasks_of_wrong_shapes_are_refused_traced_or_not(change):
+    tasks = NEAR.replace(**change)
+    for call in (ENV.reset, jax.jit(ENV.reset), lambda *a: jax.eval_shape(ENV.reset, *a)):
+        assert_one_line(lambda: call(jax.random.key(0), UMAZE, tasks), f"tasks.({'|'.join(change)}) ")  # noqa: B023
+
+
+@pytest.mark.parametrize(("change", "match"), WRONG_VALUES, ids=lambda value: value if isinstance(value, str) else "")
+def test_tasks_that_do_not_fit_the_maze_are_refused(change, match):
+    tasks = NEAR.replace(**change)
+    assert_one_line(lambda: ENV.reset(jax.random.key(0), UMAZE, tasks), match)
+    assert_one_line(lambda: check_tasks(tasks, UMAZE), match)
+    for shared in (jax.vmap(ENV.reset, (0, None, None)), lambda *a: jax.jit(lambda k: ENV.reset(k, *a[1:]))(a[0][0])):
+        assert_one_line(lambda: shared(keys(0, 2), UMAZE, tasks), match)  # noqa: B023
+    jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE, tasks)  # without values, nobody can tell
+
+
+def test_tasks_that_are_never_drawn_may_be_anything():
+    tasks = NEAR.replace(n=jnp.array(2), start=NEAR.start.at[2].set(jnp.nan), goal=NEAR.goal.at[2].set(2.0))
+    ENV.reset(jax.random.key(0), UMAZE, tasks)
+    ENV.reset(jax.random.key(0), UMAZE, tasks.replace(follow=jnp.array([[1], [0], [1]])))
+
+
+def test_tasks_out_of_reach_of_any_check_are_what_the_docstring_says():
+    begin = jax.jit(lambda tasks: ENV.reset(jax.random.key(0), UMAZE, tasks).pipeline_state)
+    assert begin(NEAR.replace(n=jnp.array(0))).task == 0
+    far = NEAR.replace(n=jnp.array(10**9))
+    np.testing.assert_array_equal(begin(far).goal, NEAR.goal[2])
+
+
+def test_a_maze_of_other_cells_and_many_mazes_are_refused():
+    other = load_maze("antmaze-umaze", cell_m=3.0)
+    for call in (ENV.reset, jax.vmap(ENV.reset, (0, None))):
+        key = jax.random.key(0) if call == ENV.reset else keys(0, 2)
+        assert_one_line(lambda: call(key, other), "cells are not 4.0 m wide")  # noqa: B023
+    many = stack_mazes([UMAZE, UMAZE])
+    for call in (ENV.reset, jax.jit(ENV.reset)):
+        assert_one_line(lambda: call(jax.random.key(0), many), "vmap")  # noqa: B023
+    assert_one_line(lambda: MazeEnv(engine="mujoco", maze=many), "vmap")
+
+
+@pytest.mark.parametrize("shape", [(1,), (), (3,), (1, 2), (2, 2)])
+def test_an_action_of_another_shape_is_refused_traced_or_not(shape):
+    state = jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE)
+    for call in (ENV.step, jax.jit(ENV.step)):
+        assert_one_line(lambda: jax.eval_shape(call, state, jnp.ones(shape)), "action has shape")  # noqa: B023
+    states = jax.eval_shape(jax.vmap(ENV.reset, (0, None)), keys(0), UMAZE)
+    many = jax.vmap(ENV.step)
+    assert_one_line(lambda: jax.eval_shape(many, states, jnp.ones((N, *shape))), "action has shape")

@@ -7,8 +7,12 @@ similar size share one compiled program. Everything outside the array is wall.
 """
 
 import functools
+import json
+import os
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +26,22 @@ from ct_envs.errors import UserError
 PAD = 12  # arrays are padded to a multiple of this many cells
 CELL_M = 4.0  # side of a cell [m], as in D4RL's ant mazes
 MAX_SIDE = 1024  # most cells along a side of a maze file
-_MAX_BYTES = MAX_SIDE * (MAX_SIDE + 2)
+_MAX_BYTES = 8 * MAX_SIDE * (MAX_SIDE + 2)  # as JSON with each cell on a line of its own
 WALL, FREE = "#", "."
+
+
+class Marks(NamedTuple):
+    """What stands for walls and free cells where a maze is written down."""
+
+    wall: str
+    free: str  # each of these characters
+
+    def __str__(self) -> str:
+        return f"'{self.wall}' (wall) or {', '.join(map(repr, self.free))} (free)"
+
+
+DRAWN = Marks(WALL, FREE)
+LISTED = Marks("1", "0rgc")  # Gymnasium-Robotics' maps also mark where resets ("r"), goals ("g") or both ("c") may be
 
 
 @struct.dataclass
@@ -47,27 +65,33 @@ class Maze:
         return self.walls.shape[-2], self.walls.shape[-1]
 
 
-def make_maze(walls: np.ndarray, *, cell_m: float = CELL_M, shape: tuple[int, int] | None = None) -> Maze:
+def make_maze(
+    walls: np.ndarray | Sequence[Sequence[int | str]],
+    *,
+    cell_m: float = CELL_M,
+    shape: tuple[int, int] | None = None,
+) -> Maze:
     """Build a ``Maze`` from a wall grid.
 
     Args:
-        walls: bool [H, W], row 0 lowest.
+        walls: an array [H, W] is a grid in the maze's coordinates, row 0 lowest: bool, or integers 0 (free) and 1
+            (wall). A nested list is a drawing as Gymnasium-Robotics has it, first row on top: 1 is a wall; 0, "r",
+            "g" and "c" are free.
         cell_m: side of a cell [m].
         shape: padded (H, W); by default the next multiples of ``PAD``.
 
     Raises:
-        UserError: no free cell, free cells on the border, or ``shape`` is too small.
+        UserError: entries that mean nothing, ragged rows, no free cell, free cells on the border, ``shape`` is too
+            small, or ``cell_m`` is no length.
     """
-    walls = np.asarray(walls, bool)
-    if walls.ndim != 2 or walls.all():
-        raise UserError("maze has no free cell; draw free cells as '.'")
+    walls = _listed(walls, "maze") if isinstance(walls, list | tuple) else _grid(np.asarray(walls))
+    if not (np.isfinite(cell_m) and cell_m > 0):
+        raise UserError(f"maze with cells of {cell_m} m; give a length above 0")
     height, width = shape or tuple(-(-n // PAD) * PAD for n in walls.shape)
     if height < walls.shape[0] or width < walls.shape[1]:
         raise UserError(f"maze of {walls.shape} cells does not fit into shape {(height, width)}")
     padded = np.ones((height, width), bool)
     padded[: walls.shape[0], : walls.shape[1]] = walls
-    if not (padded[[0, -1]].all() and padded[:, [0, -1]].all()):
-        raise UserError("maze is free at the border; close it with walls")
 
     labels, _ = label_regions(~padded)
     flat = np.flatnonzero(~padded)
@@ -109,7 +133,7 @@ def maze_names() -> list[str]:
 
 
 def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
-    """Load a named layout, or a text file of ``#`` (wall) and ``.`` (free).
+    """Load a named layout, or a maze file as ``parse_walls`` reads it.
 
     Raises:
         UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the mend).
@@ -118,13 +142,13 @@ def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
 
 
 def load_walls(name_or_file: str | Path) -> np.ndarray:
-    """The wall grid of a named layout or text file, bool [H, W], row 0 lowest, no padding. Raises as ``load_maze``."""
+    """The wall grid of a named layout or maze file, bool [H, W], row 0 lowest, no padding. Raises as ``load_maze``."""
     name = str(name_or_file)
     if name in maze_names():
         text = (resources.files("ct_envs") / "mazes" / f"{name}.txt").read_text("utf-8")
         return parse_walls(text, source=name)
     path = Path(name)
-    if not path.is_file():
+    if not os.path.isfile(name):  # unlike Path.is_file, it takes names that no file can have
         raise UserError(f"no maze or file named '{name}'; named mazes: {', '.join(maze_names())}")
     if path.stat().st_size > _MAX_BYTES:
         raise UserError(f"{path}: too large for a maze; at most {MAX_SIDE} x {MAX_SIDE} cells")
@@ -137,32 +161,123 @@ def load_walls(name_or_file: str | Path) -> np.ndarray:
 
 
 def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
-    """Parse maze text to bool [H, W], row 0 lowest. Line ends may be CRLF; trailing blank lines are ignored.
+    """Parse maze text to bool [H, W], row 0 lowest.
+
+    A line is a row of cells, the first one on top: all of them of ``#`` (wall) and ``.`` (free), or all of ``1``
+    (wall) and ``0``, ``r``, ``g`` and ``c`` (free). Line ends may be CRLF. A byte order mark, spaces at the end of a
+    line, and blank lines above and below the maze are ignored. So is a comment: ``#``, a space, and text with a letter
+    and without another ``#``. No row is taken for one, even if it was drawn with spaces: a row has two walls.
+    Text that begins with ``[`` is JSON: a nested list, as ``make_maze`` reads it.
 
     Raises:
-        UserError: empty, ragged, unknown character, all wall, or free cells on the border.
+        UserError: empty, ragged, unknown character, no JSON, all wall, or free cells on the border.
     """
-    lines = text.replace("\r\n", "\n").rstrip("\n \t").split("\n")
-    if lines == [""]:
+    text = text.removeprefix("\ufeff")
+    if text.lstrip().startswith("["):
+        return _listed(_json(text, source), source)
+    rows = _rows(text)
+    if not rows:
         raise UserError(f"{source}: empty; a maze is lines of '#' (wall) and '.' (free)")
-    width, widest = len(lines[0]), max(map(len, lines))
-    if max(widest, len(lines)) > MAX_SIDE:  # before a look at each of its cells
-        raise UserError(f"{source}: {len(lines)} x {widest} cells; at most {MAX_SIDE} x {MAX_SIDE}")
-    for number, line in enumerate(lines, 1):
-        for column, char in enumerate(line, 1):
-            if char not in (WALL, FREE):
-                raise UserError(f"{source}:{number}: column {column} is {char!r}; use '#' (wall) or '.' (free)")
-        if len(line) != width:
-            raise UserError(f"{source}:{number}: {len(line)} cells, but line 1 has {width}; make all lines equal")
-    walls = np.array([[char == WALL for char in line] for line in lines])
+    (first, top), widest = rows[0], max(len(row) for _, row in rows)
+    if max(widest, len(rows)) > MAX_SIDE:  # before a look at each of its cells
+        raise UserError(f"{source}: {len(rows)} x {widest} cells; at most {MAX_SIDE} x {MAX_SIDE}")
+    marks = LISTED if top[:1] and top[0] in (LISTED.wall, *LISTED.free) else DRAWN
+    known = {marks.wall, *marks.free}
+    for number, row in rows:
+        for column, char in enumerate(row, 1):
+            if char not in known:
+                raise UserError(f"{source}:{number}: column {column} is {char!r}; use {marks}")
+        if len(row) != len(top):
+            mend = f"line {first} has {len(top)}; make all lines equal"
+            raise UserError(f"{source}:{number}: {len(row)} cells, but {mend}")
+    walls = np.array([[char == marks.wall for char in row] for _, row in rows])
+    _check_closed(walls, marks, source, lambda row, column: f"{source}:{rows[row][0]}: column {column + 1}")
+    return walls[::-1]
+
+
+def _rows(text: str) -> list[tuple[int, str]]:
+    """The rows of maze text, each with the number of its line: no comments, no blank lines above and below."""
+    lines = [(number, line.rstrip(" \t")) for number, line in enumerate(text.replace("\r\n", "\n").split("\n"), 1)]
+    lines = [(number, line) for number, line in lines if not _is_comment(line)]
+    drawn = [i for i, (_, line) in enumerate(lines) if line]
+    return lines[drawn[0] : drawn[-1] + 1] if drawn else []
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is a comment, as ``parse_walls`` says."""
+    return line.startswith(f"{WALL} ") and line.count(WALL) == 1 and any(map(str.isalpha, line))
+
+
+def _json(text: str, source: str) -> Any:
+    """What JSON text holds. Raises UserError."""
+    mend = 'write a nested list such as [[1, 1, 1], [1, "r", 1], [1, 1, 1]]'
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as bad:
+        raise UserError(f"{source}:{bad.lineno}: not JSON ({bad.msg}); {mend}") from None
+    except (ValueError, RecursionError):  # a number of thousands of digits, thousands of brackets
+        raise UserError(f"{source}: not the JSON of a maze; {mend}") from None
+
+
+def _listed(rows: list | tuple, source: str) -> np.ndarray:
+    """The grid bool [H, W], row 0 lowest, of a nested list whose first row is on top. Raises UserError."""
+    for number, row in enumerate(rows, 1):
+        if not isinstance(row, list | tuple):
+            raise UserError(f"{source}: row {number} is {_brief(row)}; give a list of rows, each a list of cells")
+        if max(len(row), len(rows)) > MAX_SIDE:
+            raise UserError(f"{source}: {len(rows)} x {len(row)} cells; at most {MAX_SIDE} x {MAX_SIDE}")
+        for column, cell in enumerate(row, 1):
+            if not _is_listed(cell):
+                raise UserError(f"{source}: row {number}, column {column} is {_brief(cell)}; use {LISTED}")
+        if len(row) != len(rows[0]):
+            mend = f"row 1 has {len(rows[0])}; make all rows equal"
+            raise UserError(f"{source}: row {number} has {len(row)} cells, but {mend}")
+    walls = np.array([[cell == 1 for cell in row] for row in rows], bool)
+    _check_closed(walls, LISTED, source, lambda row, column: f"{source}: row {row + 1}, column {column + 1}")
+    return walls[::-1]
+
+
+def _is_listed(cell: Any) -> bool:
+    """Whether an entry of a nested list is a cell: 0, 1, "r", "g" or "c". Bools are not: which of their two readings
+    is meant, the list's or the array's, nobody can tell."""
+    if isinstance(cell, str):
+        return cell in ("r", "g", "c")
+    return isinstance(cell, int | np.integer) and not isinstance(cell, bool) and cell in (0, 1)
+
+
+def _grid(walls: np.ndarray) -> np.ndarray:
+    """An array of bools, or of integers 0 and 1, as bool [H, W], row 0 lowest. Raises UserError for any other."""
+    if walls.ndim != 2:
+        raise UserError(f"maze of shape {walls.shape}; give a grid [H, W] of walls, row 0 lowest")
+    if walls.dtype.kind not in "biu":
+        raise UserError(f"maze of {walls.dtype} entries; give bools, or integers 0 (free) and 1 (wall)")
+    strange = walls[(walls != 0) & (walls != 1)]
+    if len(strange):
+        raise UserError(f"maze with an entry {strange[0]}; give bools, or integers 0 (free) and 1 (wall)")
+    grid = walls.astype(bool)
+    _check_closed(grid, LISTED, "maze", lambda row, column: f"maze: row {row}, column {column} of the array")
+    return grid
+
+
+def _brief(value: Any) -> str:
+    """Anything in a few characters of one line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def _check_closed(walls: np.ndarray, marks: Marks, source: str, place: Callable[[int, int], str]) -> None:
+    """Raise UserError unless a grid has a free cell and walls all around.
+
+    Args:
+        place: says where the cell in that row and column is.
+    """
     if walls.all():
-        raise UserError(f"{source}: no free cell; draw free cells as '.'")
+        raise UserError(f"{source}: no free cell; draw free cells as '{marks.free[0]}'")
     border = walls.copy()
     border[1:-1, 1:-1] = True
     if not border.all():
-        row, column = np.argwhere(~border)[0]
-        raise UserError(f"{source}:{row + 1}: column {column + 1} is free at the border; close the maze with '#'")
-    return walls[::-1]
+        row, column = (int(i) for i in np.argwhere(~border)[0])
+        raise UserError(f"{place(row, column)} is free at the border; close the maze with '{marks.wall}'")
 
 
 def random_walls(

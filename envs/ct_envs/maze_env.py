@@ -1,7 +1,9 @@
 """``MazeEnv``: a robot in a maze as a ``brax.envs.Env``, pure in ``reset`` and ``step``.
 
 The maze and the tasks (starts and goals) are data that travel in ``state.info``, so each environment under ``vmap`` can
-have its own and a new maze compiles nothing.
+have its own and a new maze compiles nothing. What changes within an episode lies in ``state.pipeline_state``, its goal
+and its clock included: brax's training wrappers begin an episode anew by putting back its first ``pipeline_state`` and
+``obs``, and nothing else.
 """
 
 import copy
@@ -10,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
+from brax.envs.base import Env, State, Wrapper
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -32,15 +34,99 @@ class Tasks:
     turn_rad: Float[Array, "*b"] | None = None  # a robot with a heading begins within this of facing its goal
 
 
+def check_tasks(tasks: Tasks, maze: Maze) -> None:
+    """Raise UserError unless the tasks of one environment, without leading axes, can be tasks in that maze.
+
+    Shapes are looked at always. Values are looked at unless they are traced: every task that can be drawn begins and
+    ends at finite points of free cells, and ``n`` and ``follow`` point at tasks that are there.
+    """
+    m = jnp.shape(tasks.start)[0] if jnp.ndim(tasks.start) else 0
+    shapes = {"start": (m, 2), "goal": (m, 2), "n": ()}
+    shapes |= {} if tasks.follow is None else {"follow": (m, *jnp.shape(tasks.follow)[1:2])}
+    shapes |= {} if tasks.turn_rad is None else {"turn_rad": ()}
+    for name, shape in shapes.items():
+        found = jnp.shape(getattr(tasks, name))
+        if found != shape or 0 in shape or (name == "follow" and len(shape) != 2):
+            wanted = {"start": "[M, 2]", "goal": "[M, 2]", "follow": "[M, D]"}.get(name, "a scalar")
+            raise UserError(f"tasks.{name} has shape {found}; give {wanted} for each environment, the same M for all")
+        if name in ("n", "follow") and not jnp.issubdtype(jnp.result_type(getattr(tasks, name)), jnp.integer):
+            raise UserError(f"tasks.{name} has entries of {jnp.result_type(getattr(tasks, name))}; give integers")
+    if not _is_traced((tasks, maze)):
+        _check_values(tasks, maze, m)
+
+
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _check_values(tasks: Tasks, maze: Maze, m: int) -> None:
+    """The part of ``check_tasks`` that looks at values."""
+    n, follow = int(tasks.n), np.asarray([] if tasks.follow is None else tasks.follow, int)
+    if not 1 <= n <= m:
+        raise UserError(f"tasks.n is {n}; give a number from 1 to {m}, the tasks that there are")
+    if ((follow < 0) | (follow >= m)).any():
+        wrong = follow[(follow < 0) | (follow >= m)][0]
+        raise UserError(f"tasks.follow has an entry {wrong}; give numbers of tasks, from 0 to {m - 1}")
+    if tasks.turn_rad is not None and not np.isfinite(tasks.turn_rad):
+        raise UserError(f"tasks.turn_rad is {tasks.turn_rad}; give a finite angle [rad]")
+    drawn = np.union1d(np.arange(n), follow).astype(int)
+    walls, cell_m = np.asarray(maze.walls), float(maze.cell_m)
+    for name in ("start", "goal"):
+        points = np.asarray(getattr(tasks, name), np.float64)[drawn]
+        column, row = np.moveaxis(np.floor(np.nan_to_num(points) / cell_m), -1, 0)
+        inside = np.isfinite(points).all(-1) & (row >= 0) & (column >= 0)
+        inside &= (row < walls.shape[0]) & (column < walls.shape[1])
+        free = inside.copy()
+        free[inside] = ~walls[row[inside].astype(int), column[inside].astype(int)]
+        if not free.all():
+            which = int(np.argmin(free))
+            x, y = points[which]
+            where = f"tasks.{name}[{drawn[which]}] is ({x:g}, {y:g}) m"
+            raise UserError(f"{where}, in a wall or outside the maze; give points of free cells")
+
+
+@struct.dataclass
+class EpisodeState(PhysicsState):
+    """``pipeline_state``: the physics, and what else is of one episode."""
+
+    goal: Float[Array, "*b 2"]  # [m]
+    task: Int[Array, "*b"]  # its number among the tasks
+    episode_steps: Int[Array, "*b"]  # control steps so far
+
+
+class MazeState(State):
+    """brax's ``State``, whose ``info`` tells of the ``pipeline_state`` that it has.
+
+    Whoever puts in another ``pipeline_state``, as brax's wrappers do to begin an episode anew, gets its ``position``,
+    ``goal``, ``task`` and ``episode_steps`` in ``info``.
+    """
+
+    def replace(self, **updates: Any) -> "MazeState":
+        """A state with other fields."""
+        if isinstance(episode := updates.get("pipeline_state"), EpisodeState):
+            shown = {name: getattr(episode, name) for name in ("goal", "task", "episode_steps")}
+            shown["position"] = episode.qpos[..., :2]
+            updates["info"] = updates.get("info", self.info) | shown
+        return super().replace(**updates)
+
+
+jax.tree_util.register_dataclass(MazeState, [*State.__dataclass_fields__], [])
+
+
 class MazeEnv(Env):
     """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-F).
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
     velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
-    Action: [-1, 1]^nu, shares of the actuators' range. An episode ends with success (within the goal tolerance), with a
-    failure (a fall, or a state or action that is not finite) or, as truncation, at the horizon. ``state.info`` holds
-    ``success``, ``fall``, ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``,
-    ``position``, ``goal``, ``maze``, ``tasks`` and ``key``.
+    Action: [-1, 1]^nu, shares of the actuators' range; what lies beyond is clipped. An episode ends with success
+    (within the goal tolerance), with a failure (a fall, or a state or action that is not finite, which leaves the robot
+    where it was) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``, ``diverged`` (something
+    was not finite), ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``,
+    ``goal``, ``task``, ``maze``, ``tasks`` and ``key``.
+
+    brax's training wrappers end an episode at their own ``episode_length`` and begin it anew from its first state: give
+    them an environment with a longer horizon, for they take the end at its own for a failure. Networks that want one
+    array for an observation: ``FlatObservation``.
     """
 
     def __init__(
@@ -72,8 +158,8 @@ class MazeEnv(Env):
         Raises:
             UserError: unknown robot or engine, cells too small for the robot, or a maze with cells of another size.
         """
-        if maze is not None and not np.allclose(maze.cell_m, cell_m):
-            raise UserError(f"the maze's cells are not {cell_m} m wide; give MazeEnv the maze's own cell_m")
+        if maze is not None:
+            _check_maze(maze, cell_m)
         self.robot = get_robot(robot, "maze") if isinstance(robot, str) else robot
         self.engine = make_engine(engine, self.robot, cell_m=cell_m)
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
@@ -106,44 +192,59 @@ class MazeEnv(Env):
     def backend(self) -> str:
         return self.engine.name
 
-    def reset(self, rng: jax.Array, maze: Maze | None = None, tasks: Tasks | None = None) -> State:
-        """A fresh episode in ``maze``, from a random free point to another of the same region, or from ``tasks``."""
+    def reset(self, rng: jax.Array, maze: Maze | None = None, tasks: Tasks | None = None) -> MazeState:
+        """A fresh episode in ``maze``, from a random free point to another of the same region, or from ``tasks``.
+
+        Values of ``maze`` and ``tasks`` that are traced, by ``jit`` or ``vmap``, cannot be checked; their shapes are.
+        Then walls stand in other places than on the map if its cells have another size, a robot begins where it is
+        told to, be it in a wall, and a goal in a wall or of NaN is never reached. A task's number beyond the last means
+        the last, and ``n`` below 1 the first. Call ``check_tasks`` first where they may be wrong.
+
+        Raises:
+            UserError: no maze; maze or tasks of wrong shapes or values, see ``check_tasks``.
+        """
         maze = self.maze if maze is None else maze
         if maze is None:
             raise UserError("MazeEnv.reset needs a maze: give one to it or to MazeEnv(maze=...)")
+        _check_maze(maze, self.engine.cell_m)
+        if tasks is not None:
+            check_tasks(tasks, maze)
         key, now = jax.random.split(rng)
-        zero = jnp.zeros(())
+        zero = jnp.zeros((), jnp.float32)
         info = {"key": key, "maze": maze, "tasks": tasks}
-        info |= {"truncation": zero, "success": zero, "fall": zero, "collision": zero}
-        return self._begin(now, State(None, {}, zero, zero, {}, info))
+        info |= dict.fromkeys(("truncation", "success", "fall", "diverged", "collision"), zero)
+        return self._observe(self._begin(now, maze, tasks), MazeState(None, {}, zero, zero, {}, info))
 
-    def _begin(self, key: jax.Array, state: State) -> State:
-        """The first state of an episode, in the maze and with the tasks of ``state``."""
+    def _begin(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> EpisodeState:
+        """The beginning of an episode."""
         task_key, physics_key = jax.random.split(key)
-        task, start, goal = self._draw_task(task_key, state.info["maze"], state.info["tasks"])
-        physics = self._initial_physics(physics_key, start, goal, state.info["tasks"])
-        info = state.info | {"task": task, "goal": goal, "episode_steps": jnp.zeros((), jnp.int32)}
-        return self._observe(physics, state.replace(info=info))
+        task, start, goal = self._draw_task(task_key, maze, tasks)
+        physics = self._initial_physics(physics_key, start, goal, tasks)
+        steps = jnp.zeros((), jnp.int32)
+        return EpisodeState(physics.qpos, physics.qvel, physics.qacc_warmstart, goal, task, steps)
 
     def _draw_task(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Number, start and goal of a task."""
         if tasks is not None:
-            i = jax.random.randint(key, (), 0, tasks.n)
-            return i, tasks.start[i], tasks.goal[i]
+            i = jax.random.randint(key, (), 0, tasks.n, jnp.int32)
+            start, goal = (jnp.asarray(points, jnp.float32) for points in (tasks.start, tasks.goal))
+            return i, start[i], goal[i]
         return jnp.zeros((), jnp.int32), *sample_pair(key, maze, radius=self.robot.radius_m)
 
-    def _go_on(self, key: jax.Array, finished: State, fresh: State) -> tuple[PhysicsState, State]:
-        """After a success, where tasks follow each other: the robot as it is, with the next goal."""
-        tasks: Tasks | None = finished.info["tasks"]
-        physics: Any = fresh.pipeline_state
+    def _go_on(
+        self, key: jax.Array, tasks: Tasks | None, finished: EpisodeState, won: jax.Array, fresh: EpisodeState
+    ) -> EpisodeState:
+        """What follows a finished episode: a fresh one, or after a success, where tasks follow each other, the robot
+        as it is, with the next goal."""
         if tasks is None or tasks.follow is None:
-            return physics, fresh
-        won = finished.info["success"] > 0
-        choice = jax.random.randint(key, (), 0, tasks.follow.shape[-1])
-        task = jnp.where(won, tasks.follow[finished.info["task"], choice], fresh.info["task"])
-        physics = jax.tree.map(lambda old, new: jnp.where(won, old, new), finished.pipeline_state, physics)
-        goal = jnp.where(won, tasks.goal[task], fresh.info["goal"])
-        return physics, fresh.replace(info=fresh.info | {"task": task, "goal": goal})
+            return fresh
+        follow = jnp.asarray(tasks.follow, jnp.int32)
+        choice = jax.random.randint(key, (), 0, follow.shape[-1], jnp.int32)
+        task = jnp.where(won, follow[finished.task, choice], fresh.task)
+        goal = jnp.where(won, jnp.asarray(tasks.goal, jnp.float32)[task], fresh.goal)
+        robot = {name: getattr(finished, name) for name in PhysicsState.__dataclass_fields__}
+        robot = {name: jnp.where(won, old, getattr(fresh, name)) for name, old in robot.items()}
+        return fresh.replace(**robot, task=task, goal=goal)
 
     def _initial_physics(self, key: jax.Array, start: jax.Array, goal: jax.Array, tasks: Tasks | None) -> PhysicsState:
         """Standing at ``start`` [m]; a robot that has a heading looks anywhere, or not too far from its goal."""
@@ -151,18 +252,18 @@ class MazeEnv(Env):
         speed_key, yaw_key, joint_key = jax.random.split(key, 3)
         qpos = jnp.asarray(model.key_qpos[0] if model.nkey else model.qpos0, jnp.float32).at[:2].set(start)
         if robot.has_heading:
-            yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+            yaw = jax.random.uniform(yaw_key, (), jnp.float32, minval=-jnp.pi, maxval=jnp.pi)
             if tasks is not None and tasks.turn_rad is not None:
                 x, y = goal - start
-                yaw = jnp.arctan2(y, x) + tasks.turn_rad / jnp.pi * yaw
+                yaw = jnp.arctan2(y, x) + jnp.asarray(tasks.turn_rad, jnp.float32) / jnp.pi * yaw
             half = yaw / 2.0
-            qpos = qpos.at[3:7].set(jnp.array([jnp.cos(half), 0.0, 0.0, jnp.sin(half)]))
-            noise = jax.random.uniform(joint_key, qpos[7:].shape, minval=-1.0, maxval=1.0)
+            qpos = qpos.at[3:7].set(jnp.array([jnp.cos(half), 0.0, 0.0, jnp.sin(half)], jnp.float32))
+            noise = jax.random.uniform(joint_key, qpos[7:].shape, jnp.float32, minval=-1.0, maxval=1.0)
             qpos = qpos.at[7:].add(robot.reset_joints_rad * noise)
-        qvel = jnp.zeros(model.nv)
+        qvel = still = jnp.zeros(model.nv, jnp.float32)
         if self._reset_velocity:
-            qvel = self._reset_velocity * jax.random.normal(speed_key, (model.nv,))
-        return PhysicsState(qpos, qvel, jnp.zeros(model.nv))
+            qvel = self._reset_velocity * jax.random.normal(speed_key, (model.nv,), jnp.float32)
+        return PhysicsState(qpos, qvel, still)
 
     def _fell(self, physics: PhysicsState) -> jax.Array:
         """Whether the torso is tilted too far or too low."""
@@ -174,48 +275,100 @@ class MazeEnv(Env):
             fell |= physics.qpos[2] < self.robot.height_min_m
         return fell
 
-    def _observe(self, physics: PhysicsState, state: State) -> State:
-        position, goal = physics.qpos[:2], state.info["goal"]
-        obs = {"proprio": jnp.concatenate([physics.qpos[2:], physics.qvel]), "goal": goal - position}
+    def _observe(self, episode: EpisodeState, state: MazeState) -> MazeState:
+        position, goal = episode.qpos[:2], episode.goal
+        obs = {"proprio": jnp.concatenate([episode.qpos[2:], episode.qvel]), "goal": goal - position}
         if self.maps:
             obs["map"] = local_map(state.info["maze"], position, goal, cell_m=self.map_cell_m)
-        return state.replace(pipeline_state=physics, obs=obs, info=state.info | {"position": position})
+        return state.replace(pipeline_state=episode, obs=obs)
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: MazeState, action: jax.Array) -> MazeState:
         """One control step. With ``auto_reset`` a finished state comes back as the first of the next episode, with the
-        reward, ``done`` and outcome of the finished one."""
-        before = state.pipeline_state
+        reward, ``done`` and outcome of the finished one.
+
+        Raises:
+            UserError: an action of another shape than [nu].
+        """
+        if jnp.shape(action) != (self.action_size,):
+            raise UserError(
+                f"the action has shape {jnp.shape(action)}; give [{self.action_size}], for several environments under "
+                "jax.vmap(env.step)"
+            )
+        action = jnp.asarray(action, jnp.float32)
+        before: Any = state.pipeline_state
         walls = nearest_walls(state.info["maze"], before.qpos[:2])
-        ctrl = jnp.clip(action, -1.0, 1.0)
+        # MuJoCo would read an action that is not a number as zero, and carry on.
+        usable = jnp.all(jnp.isfinite(action))
+        ctrl = jnp.where(usable, jnp.clip(action, -1.0, 1.0), 0.0)
         physics, touching = self.engine.step(before, self._ctrl_max * ctrl, walls)
-        # The action too: MuJoCo would read one that is not a number as zero, and carry on.
-        finite = jnp.all(jnp.isfinite(jnp.concatenate([physics.qpos, physics.qvel, ctrl])))
-        physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), physics, before)
+        finite = usable & jnp.all(jnp.isfinite(jnp.concatenate([physics.qpos, physics.qvel])))
+        moved = {name: getattr(physics, name) for name in PhysicsState.__dataclass_fields__}
+        moved = {name: jnp.where(finite, new, getattr(before, name)) for name, new in moved.items()}
+        episode: EpisodeState = before.replace(**moved, episode_steps=before.episode_steps + 1)
 
         info = dict(state.info)
-        position = physics.qpos[:2]
-        distance = jnp.linalg.norm(info["goal"] - position)
-        steps = info["episode_steps"] + 1
-        fall = finite & self._fell(physics)
+        distance = jnp.linalg.norm(episode.goal - episode.qpos[:2])
+        fall = finite & self._fell(episode)
         success = finite & ~fall & (distance < self.robot.goal_tolerance_m)
-        over = steps >= self.horizon
+        over = episode.episode_steps >= self.horizon
         done = success | fall | ~finite | over
         info |= {
-            "episode_steps": steps,
             "success": success.astype(jnp.float32),
             "fall": fall.astype(jnp.float32),
+            "diverged": (~finite).astype(jnp.float32),
             "collision": jnp.where(finite, touching, 0.0),
             "truncation": (over & ~success & ~fall & finite).astype(jnp.float32),
         }
         stepped = state.replace(reward=-distance, done=done.astype(jnp.float32), info=info)
         if not self.auto_reset:
-            stepped = self._observe(physics, stepped)
+            stepped = self._observe(episode, stepped)
             return jax.tree.map(lambda new, old: jnp.where(state.done > 0, old, new), stepped, state)
         key, now, follow_key = jax.random.split(info["key"], 3)
-        stepped = stepped.replace(info=info | {"key": key}, pipeline_state=physics)
-        fresh = self._begin(now, stepped)  # only what differs is chosen below; the observation is made once
-        after, fresh = self._go_on(follow_key, stepped, fresh)
-        names = ("task", "goal", "episode_steps")
-        chosen = {name: jnp.where(done, fresh.info[name], stepped.info[name]) for name in names}
-        physics = jax.tree.map(lambda a, b: jnp.where(done, a, b), after, physics)
-        return self._observe(physics, stepped.replace(info=stepped.info | chosen))
+        fresh = self._begin(now, info["maze"], info["tasks"])
+        after = self._go_on(follow_key, info["tasks"], episode, success, fresh)
+        episode = jax.tree.map(lambda a, b: jnp.where(done, a, b), after, episode)
+        return self._observe(episode, stepped.replace(info=info | {"key": key}))
+
+
+def _check_maze(maze: Maze, cell_m: float) -> None:
+    """Raise UserError unless it is one maze, with cells of that size as far as that is known yet."""
+    if jnp.ndim(maze.walls) != 2:
+        raise UserError(
+            f"the maze's walls have shape {jnp.shape(maze.walls)}; reset many mazes under jax.vmap(env.reset)"
+        )
+    if not _is_traced(maze.cell_m) and not np.allclose(maze.cell_m, cell_m):
+        raise UserError(f"the maze's cells are not {cell_m} m wide; give MazeEnv the maze's own cell_m")
+
+
+class FlatObservation(Wrapper):
+    """A ``MazeEnv`` whose observation is one array: proprioception, the vector to the goal and, with ``maps``, the map.
+
+    For learners such as brax's PPO: ``ppo.train(environment=FlatObservation(MazeEnv(maze=...)), ...)``.
+    """
+
+    env: MazeEnv
+
+    def __init__(self, env: MazeEnv):
+        super().__init__(env)
+        self._shapes = {name: env.observation_size[name] for name in ("proprio", "goal", "map")[: 2 + env.maps]}
+
+    @property
+    def observation_size(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return sum(int(np.prod(shape)) for shape in self._shapes.values())
+
+    def reset(self, rng: jax.Array, maze: Maze | None = None, tasks: Tasks | None = None) -> MazeState:
+        """As ``MazeEnv.reset``."""
+        return self._flat(self.env.reset(rng, maze, tasks))
+
+    def step(self, state: MazeState, action: jax.Array) -> MazeState:
+        """As ``MazeEnv.step``."""
+        ends = np.cumsum([np.prod(shape) for shape in self._shapes.values()])[:-1].tolist()
+        parts = zip(self._shapes.items(), jnp.split(state.obs, ends), strict=True)  # pyright: ignore
+        obs = {name: part.reshape(shape) for (name, shape), part in parts}
+        if self.env.maps:
+            obs["map"] = obs["map"].astype(jnp.uint8)
+        return self._flat(self.env.step(state.replace(obs=obs), action))
+
+    def _flat(self, state: MazeState) -> MazeState:
+        obs: Any = state.obs
+        return state.replace(obs=jnp.concatenate([obs[name].astype(jnp.float32).ravel() for name in self._shapes]))
