@@ -16,7 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, subcommand
+from tyro.conf import (
+    AvoidSubcommands,
+    Fixed,
+    FlagCreatePairsOff,
+    Positional,
+    Suppress,
+    UseAppendAction,
+    arg,
+    subcommand,
+)
 
 from ct_envs.errors import UserError
 from ct_jax import __version__
@@ -25,10 +34,13 @@ from ct_jax.interrupts import Terminated, interruptible
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ct_jax.presets import Settings
+
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
 INTERRUPTED = 130
 MAX_RANDOM_MAZES = 10_000
+ALL_SETTINGS = "--help-all"
 _stopped = False  # by a signal
 
 ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then cross mazes without one.
@@ -64,6 +76,9 @@ class Train:
       ct-jax train point --preset demo
       ct-jax train point --preset demo --resume
       ct-jax train point --maze my_floor.txt --maze hall --eval-maze my_other_floor.txt --out runs/mine
+      ct-jax train ant --fit.updates 500 --model.width 256 --collect.noise 0.1
+
+    Every setting of the method can be given after ROBOT; --help-all lists them, with the values of the preset.
 
     A maze file is plain text, '#' for a wall and '.' for free, closed all around; a cell is 4 m wide.
     """
@@ -92,6 +107,8 @@ class Train:
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in the folder: finished stages are skipped."""
     among: Annotated[Processes, arg(name="")] = Processes()
+    changes: Suppress[Fixed[tuple[str, ...]]] = ()
+    """Settings in place of the preset's, as they were given."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +232,9 @@ def entry() -> NoReturn:
 
 
 def _run(arguments: list[str]) -> None:
-    command = _parse(arguments)
+    command = _parse([argument for argument in arguments if argument != ALL_SETTINGS])
+    if ALL_SETTINGS in arguments:
+        return _print_settings(command)
     {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes}[type(command)](command)
 
 
@@ -243,15 +262,51 @@ def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
 
     commands = [Annotated[kind, subcommand(name, description=brief(kind))] for name, kind in COMMANDS.items()]
     choice: Any = functools.reduce(operator.or_, commands)
+    program = f"{PROGRAM} {chosen}" if chosen in COMMANDS else PROGRAM
+    with _in_one_line(f"{program} --help"):
+        if chosen != "train":
+            return tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments)
+        # What ``Train`` does not know may be a setting of the method, whose default the preset says.
+        command, changes = tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments, return_unknown_args=True)
+        return replace(command, changes=tuple(changes))
+
+
+@contextlib.contextmanager
+def _in_one_line(see: str) -> Iterator[None]:
+    """Raises UserError with what tyro prints, in one line, and the command to see."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments)
+            yield
     except SystemExit as stop:
         if not stop.code:
             raise
-        program = f"{PROGRAM} {chosen}" if chosen in COMMANDS else PROGRAM
-        raise UserError(f"{_reason(said.getvalue())}; see {program} --help") from None
+        raise UserError(f"{_reason(said.getvalue())}; see {see}") from None
+
+
+def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
+    """The preset's settings with those that were given in their place."""
+    from ct_jax.presets import Settings
+
+    with _in_one_line(f"{PROGRAM} train {command.robot} {ALL_SETTINGS}"):
+        return tyro.cli(
+            AvoidSubcommands[Settings],
+            prog=f"{PROGRAM} train {command.robot} --preset {command.preset}",
+            description="Every setting, with the value that the preset gives it.",
+            default=settings,
+            args=[*command.changes, *more],
+        )
+
+
+def _print_settings(command: Any) -> None:
+    """What ``--help-all`` shows."""
+    if not isinstance(command, Train):
+        raise UserError(f"{ALL_SETTINGS} is for: {PROGRAM} train ROBOT {ALL_SETTINGS}")
+    import ct_envs.quiet  # noqa: F401
+    from ct_jax.presets import get_preset
+
+    with contextlib.suppress(SystemExit):
+        _changed(get_preset(command.preset, command.robot), command, "--help")
 
 
 def _reason(text: str) -> str:
@@ -313,7 +368,7 @@ def _train(command: Train) -> None:
     seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
     pipeline.check_seed(command.seed)
-    settings = get_preset(command.preset, command.robot)
+    settings = _changed(get_preset(command.preset, command.robot), command)
     if command.controller is not None:
         settings = replace(settings, controller=command.controller)
     if command.random_mazes is not None:

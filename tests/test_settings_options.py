@@ -1,0 +1,79 @@
+"""Every setting of the method is an option of ``ct-jax train``, and ends in the run's settings."""
+
+import dataclasses
+import json
+
+import pytest
+
+from ct_envs import UserError
+from ct_jax import cli, pipeline
+from ct_jax.presets import Settings, get_preset, to_dict
+
+
+@pytest.fixture
+def settings_of(monkeypatch, tmp_path):
+    """The settings of the run that a command line would train."""
+
+    def settings_of(*arguments: str) -> Settings:
+        runs = []
+
+        def train(run, *, resume):
+            runs.append(run)
+            raise UserError("stop")
+
+        monkeypatch.setattr(pipeline, "train", train)
+        assert cli.main(["train", *arguments, "--out", str(tmp_path / "run")]) == cli.BAD_INPUT
+        return runs[0].settings
+
+    return settings_of
+
+
+def leaves(values: dict, path: str = ""):
+    for name, value in values.items():
+        yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(path + name, value)]
+
+
+def test_settings_take_the_place_of_the_presets(settings_of):
+    plain = get_preset("demo", "ant")
+    found = settings_of(
+        "ant", "--preset", "demo", "--fit.updates", "500", "--model.width=256", "--collect.noise", "0.3",
+        "--sac.hidden", "64", "32", "--last-fit.no-mirror", "--rounds", "2",
+    )  # fmt: skip
+    changed = {name: value for name, value in leaves(to_dict(found)) if value != dict(leaves(to_dict(plain))).get(name)}
+    assert changed == {
+        "fit.updates": 500, "model.width": 256, "collect.noise": 0.3, "sac.hidden": (64, 32), "last_fit.mirror": False,
+        "rounds": 2,
+    }  # fmt: skip
+    assert json.loads(json.dumps(to_dict(found)))["fit"]["updates"] == 500
+
+
+def test_without_changes_they_are_the_presets(settings_of):
+    assert settings_of("point", "--preset", "cpu") == get_preset("cpu", "point")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--fit.updates", "-3"], "FitConfig.updates is -3"),
+        (["--fit.updates", "many"], "'many' is no whole number"),
+        (["--fit.nonsense", "3"], "--fit.nonsense"),
+        (["--model.frame", "sideways"], "sideways"),
+        (["--model.heads", "3"], "multiple of heads"),
+        (["--fit.updates"], "--fit.updates"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(capsys, tmp_path, arguments, says):
+    assert cli.main(["train", "point", *arguments, "--out", str(tmp_path / "run")]) == cli.BAD_INPUT
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1 and says in error[0] and "--help-all" in error[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_all_lists_every_setting(capsys):
+    assert cli.main(["train", "ant", "--preset", "cpu", "--help-all"]) == 0
+    shown = capsys.readouterr().out
+    for name, _ in leaves(dataclasses.asdict(dataclasses.replace(get_preset("cpu", "ant"), rooms=None))):
+        if name != "rooms":
+            assert f"--{name.replace('_', '-')}" in shown.replace(".no-", "."), name
+    assert cli.main(["evaluate", "zoo:ant", "--help-all"]) == cli.BAD_INPUT
