@@ -16,6 +16,7 @@ from ct_envs.maze import Maze, sample_pair
 from ct_jax.devices import data_mesh, fill_up, joined, largest, own, own_rows, place, sharded
 from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
+from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, draw_joined, extend, stack_tables
 from ct_jax.rollout import Controller, Guided, Steps, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
@@ -121,6 +122,7 @@ def make_guide(name: Guide, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | Expl
     return RoadmapGuide(radius, prm.margin_m, prm.connect_m, cell_m, shortcut=name == "shortcut")
 
 
+@with_own_numerics
 def collect(
     key: jax.Array,
     env: MazeEnv,

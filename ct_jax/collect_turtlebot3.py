@@ -20,6 +20,7 @@ from ct_jax.collect import CollectConfig, Guide, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, GuidedDriver, drive, to_trajectories
 from ct_jax.explorer_turtlebot3 import ExplorerGuide
+from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
@@ -238,6 +239,7 @@ def drive_guided(
     return drive(pool, wave.episodes, driver, begin)
 
 
+@with_own_numerics
 def collect(
     key: jax.Array,
     pool: Turtlebot3Pool,

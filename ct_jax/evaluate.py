@@ -16,6 +16,7 @@ from ct_envs.maze import Maze, sample_pair
 from ct_envs.robots import Robot
 from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
 from ct_jax.devices import data_mesh, fill_up, joined, own
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import Conditioned
 from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend
 from ct_jax.rollout import Controller, Guided, Policy, Steps
@@ -98,6 +99,7 @@ def bootstrap(values: np.ndarray) -> list[float]:
     return [float(result.confidence_interval.low), float(result.confidence_interval.high)]
 
 
+@with_own_numerics
 def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: float) -> Pairs:
     """Draw pairs of free points of one region, a goal never within twice the tolerance of its start."""
     keys = jax.random.split(jax.random.key(seed), 8 * n + 64)
@@ -145,6 +147,7 @@ def beyond_horizon(robot: Robot, pairs: Pairs, horizon: int) -> int:
     return int((pairs.shortest_m > robot.cruise_mps * robot.control_dt_s * horizon).sum())
 
 
+@with_own_numerics
 def evaluate(
     env: MazeEnv,
     maze: Maze,

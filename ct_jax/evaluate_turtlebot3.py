@@ -14,13 +14,15 @@ from ct_envs.robots import TURTLEBOT3
 from ct_envs.turtlebot3 import RADIUS_M
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
 from ct_envs.turtlebot3_world import World
+from ct_jax.agent import act
 from ct_jax.collect_turtlebot3 import Room, Wave, clutter, drive_guided, make_guide
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, drive
 from ct_jax.evaluate import GUIDED, Episodes, Learned, Pairs, beyond_horizon, shortest_ways
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import Conditioned
 from ct_jax.prm import PrmConfig, build_roadmap, joins
-from ct_jax.rollout import Action, Policy
+from ct_jax.rollout import Action
 
 _EVALUATION = 1  # seeds of these rooms have three entries, those of training two: none is in both
 _DENSE = PrmConfig(samples=600, connect_m=2.0, most_samples=2400)
@@ -41,12 +43,6 @@ def as_state(frame: Frame) -> State:
     info = {"position": jnp.asarray(frame.position, jnp.float32)}
     info |= {"collision": jnp.asarray(frame.collision, jnp.float32)}
     return State(None, obs, jnp.asarray(frame.believed_reward), jnp.asarray(frame.done, jnp.float32), {}, info)
-
-
-@jax.jit
-def act(policy: Policy, memory: Any, state: State, key: jax.Array) -> tuple[Action, Any]:
-    """``policy.act``, compiled."""
-    return policy.act(memory, state, key)
 
 
 @dataclass(frozen=True)
@@ -75,6 +71,7 @@ def draw_rooms(seed: int, worlds: int, *, density: float = 1.0) -> list[World]:
     return [clutter((_EVALUATION, seed, number), density) for number in range(worlds)]
 
 
+@with_own_numerics
 def draw_room_pairs(seed: int, worlds: Sequence[World], n: int) -> Pairs:
     """n starts and goals in each world, at least 1 m apart, and the shortest ways between them on a dense roadmap."""
     parts = []
@@ -90,6 +87,7 @@ def draw_room_pairs(seed: int, worlds: Sequence[World], n: int) -> Pairs:
     return Pairs(ends[:, 0], ends[:, 1], shortest, seed, which, straight=int(straight.sum()))
 
 
+@with_own_numerics
 def evaluate_rooms(
     pool: Turtlebot3Pool,
     worlds: Sequence[World],

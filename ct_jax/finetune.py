@@ -16,6 +16,7 @@ from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.maze import Maze
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes
 from ct_jax.devices import joined
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action, Controller, Guided
@@ -95,6 +96,7 @@ class Supervised:
         return stuck | (memory.steps >= self.config.patience)
 
 
+@with_own_numerics
 def recover(
     key: jax.Array,
     env: MazeEnv,

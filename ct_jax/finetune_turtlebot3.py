@@ -10,12 +10,14 @@ from brax.envs.base import State
 from flax import struct
 
 from ct_envs.turtlebot3_pool import Frame, Turtlebot3Pool
+from ct_jax.agent import act
 from ct_jax.collect import CollectConfig
 from ct_jax.collect_turtlebot3 import draw_wave, make_guide
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import GuidedDriver, drive, to_trajectories
-from ct_jax.evaluate_turtlebot3 import act, as_state
+from ct_jax.evaluate_turtlebot3 import as_state
 from ct_jax.finetune import RecoverConfig, Supervised, gather_recoveries
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.rollout import Action
@@ -49,6 +51,7 @@ class SupervisedDriver:
         return action, (watching, led, step + 1)
 
 
+@with_own_numerics
 def recover(
     key: jax.Array,
     pool: Turtlebot3Pool,

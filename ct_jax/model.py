@@ -15,9 +15,11 @@ from ct_envs import MazeEnv, UserError
 from ct_envs.checked import shown
 from ct_envs.robots import get_robot
 from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
+from ct_jax.agent import Agent
 from ct_jax.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
@@ -37,6 +39,10 @@ class TrainedModel:
     policy: TransformerPolicy
     controller: SacController | DifferentialDrive  # learned, as ``settings.sac`` describes it, or known
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
+
+    def agent(self) -> Agent:
+        """The policy for observations of one's own."""
+        return Agent(self.policy, self.robot, sizes(self.robot)[0])
 
 
 def save_model(folder: Path, model: TrainedModel) -> None:
@@ -73,6 +79,7 @@ def model_folder(run: str) -> Path:
     raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or {_zoo_words()}")
 
 
+@with_own_numerics
 def load_model(run: str) -> TrainedModel:
     """Read the model of a run folder, a model folder or a ``zoo:NAME``.
 

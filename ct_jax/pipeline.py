@@ -25,6 +25,7 @@ from ct_jax.evaluate import METHODS
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.mazes import MazeCourse, evaluate_in_maze
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
+from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import MAX_OPTIMISM, MAX_SEED
 from ct_jax.progress import Bar, Metrics
@@ -63,6 +64,7 @@ COURSES: dict[str, Callable[[Run], Course]] = {"maze": MazeCourse, "room": RoomC
 _EVALUATIONS: dict[str, Callable[..., dict[str, Any]]] = {"maze": evaluate_in_maze, "room": evaluate_in_rooms}
 
 
+@with_own_numerics
 def train(run: Run, *, resume: bool = False) -> Path:
     """Run all stages that are not finished; returns the report's path.
 
@@ -252,6 +254,7 @@ def results(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+@with_own_numerics
 def evaluate_model(
     run: str, *, method: str, seed: int, optimism: float | None = None, **options: Any
 ) -> dict[str, Any]:  # fmt: skip

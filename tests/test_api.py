@@ -1,0 +1,140 @@
+"""``import ct_jax``: the public names, and the numerics that a caller's settings do not change."""
+
+import contextlib
+import io
+import json
+import pkgutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+import ct_jax
+from ct_envs import MazeEnv, load_maze
+from ct_jax.cli import main
+from ct_jax.rollout import act_as_meant
+
+SUBMODULES = sorted(f"ct_jax.{module.name}" for module in pkgutil.iter_modules(ct_jax.__path__))
+
+# Each public name is that of an object that stays the same, whatever is imported, in the given order.
+SAME = """
+import importlib, sys
+import ct_jax
+first = {{name: getattr(ct_jax, name) for name in ct_jax.__all__}} if {names_first} else {{}}
+for module in {modules}:
+    importlib.import_module(module)
+then = {{name: getattr(ct_jax, name) for name in ct_jax.__all__}}
+assert all(first.get(name, it) is it for name, it in then.items())
+for name, it in then.items():
+    module, own = ct_jax._SOURCE[name]
+    assert it is getattr(sys.modules[module], own), name
+    assert not isinstance(it, type(sys)), name
+"""
+
+
+def run_python(text: str) -> str:
+    """What a process of its own prints."""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_no_public_name_is_that_of_a_submodule():
+    assert not set(ct_jax.__all__) & {name.removeprefix("ct_jax.") for name in SUBMODULES}
+
+
+@pytest.mark.parametrize(("names_first", "modules"), [(True, SUBMODULES), (False, SUBMODULES[::-1])])
+def test_a_public_name_is_the_same_object_whatever_is_imported_first(names_first, modules):
+    run_python(SAME.format(names_first=names_first, modules=modules))
+
+
+def test_the_package_alone_imports_nothing_heavy():
+    said = run_python("import sys, ct_jax\nprint([m for m in ('jax', 'numpy', 'ct_envs') if m in sys.modules])")
+    assert said.strip() == "[]"
+
+
+def test_every_name_is_listed_and_no_other_is_there():
+    assert set(ct_jax.__all__) == set(ct_jax._SOURCE) <= set(dir(ct_jax))
+    with pytest.raises(AttributeError, match="has no attribute 'unicorn'"):
+        _ = ct_jax.unicorn  # pyright: ignore
+
+
+# -------------------------------------------------------------------------------------------------------- numerics
+
+
+@contextlib.contextmanager
+def other_settings():
+    """Settings of a program that has others than ours."""
+    with jax.default_matmul_precision("bfloat16"), jax.numpy_rank_promotion("raise"), jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.rank_promotion("allow")
+def test_python_and_the_command_line_evaluate_alike(tiny_run):
+    """Bit for bit, whatever the caller's settings are; and these stay as they are."""
+    folder, out = str(tiny_run.folder), io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ct_jax.cli.prepare_jax", lambda *_: None)
+        arguments = ["--maze", "antmaze-umaze", "--episodes", "3", "--horizon", "20"]
+        assert main(["evaluate", folder, *arguments, "--json"]) == 0
+    row = json.loads(out.getvalue())
+    with other_settings():
+        same = ct_jax.evaluate_model(folder, method="ct", seed=0, maze="antmaze-umaze", episodes=3, horizon=20)
+        assert jnp.zeros(1, float).dtype == jnp.float64
+        assert jax.config.jax_default_matmul_precision == "bfloat16"
+    del row["wall_s"], same["wall_s"]
+    assert row == json.loads(json.dumps(same))
+
+
+@struct.dataclass
+class Witness:
+    """A policy, or a controller, that keeps the text of a product that is compiled where it is."""
+
+    said: list = struct.field(pytree_node=False)
+    action_size: int = struct.field(pytree_node=False, default=2)
+
+    def init(self, state):
+        return jnp.zeros(state.done.shape[0])
+
+    def act(self, memory, state, key):
+        return act_as_meant(self(state.obs["proprio"], None)), memory
+
+    def __call__(self, proprio, goal):
+        one = jax.ShapeDtypeStruct((2, 2), jnp.float32)
+        self.said.append(jax.jit(jnp.dot).lower(one, one).as_text())
+        return jnp.zeros((len(proprio), 2))
+
+
+def evaluate(witness):
+    env, maze = MazeEnv("point", engine="mujoco", auto_reset=False, horizon=2), load_maze("antmaze-umaze")
+    pairs = ct_jax.draw_pairs(0, maze, 1, radius_m=0.5, tolerance_m=0.5)
+    ct_jax.evaluate_pairs(env, maze, pairs, "ct", policy=witness)
+
+
+def act(witness):
+    agent = ct_jax.Agent(witness, "point", 2)
+    seen = {"map": np.zeros((1, 2, 25, 25), np.uint8), "proprio": np.zeros((1, 2)), "goal": np.ones((1, 2))}
+    agent.act(agent.init(seen), seen, np.zeros(1))
+
+
+def collect(witness):
+    from ct_envs import stack_mazes
+
+    config = ct_jax.CollectConfig(trajectories=1, envs=1, horizon=2, give_up=1.0)
+    env = MazeEnv("point", engine="mujoco", auto_reset=False, horizon=2, maps=False)
+    mazes = stack_mazes([load_maze("antmaze-umaze")])
+    with contextlib.suppress(ct_jax.UserError):  # who stands still never arrives
+        ct_jax.collect_trajectories(jax.random.key(0), env, mazes, witness, config, ct_jax.PrmConfig(samples=20))
+
+
+@pytest.mark.rank_promotion("allow")
+@pytest.mark.parametrize("entry", [evaluate, act, collect])
+def test_products_are_exact_in_what_is_compiled(entry):
+    witness = Witness([])
+    with jax.default_matmul_precision("bfloat16"):
+        entry(witness)
+    assert witness.said and all("precision = [HIGHEST, HIGHEST]" in text for text in witness.said)
