@@ -516,6 +516,7 @@ _COLUMNS: dict[str, Callable[[Row], str]] = {
     "return / 100": lambda row: f"{row['return_scaled']:.1f}",
     "collided %": lambda row: f"{100 * row['collision_rate']:.0f}",
     "fell %": lambda row: f"{100 * row.get('fall_rate', 0.0):.0f}",
+    "diverged %": lambda row: f"{100 * row['diverged_rate']:.0f}" if row.get("diverged_rate") else "",
     "frontal %": lambda row: f"{100 * row['frontal_rate']:.0f}" if "frontal_rate" in row else "",
     "steps": lambda row: f"{row['steps_mean']:.0f}",
 }

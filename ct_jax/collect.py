@@ -18,7 +18,7 @@ from ct_jax.explorer import ExplorerGuide
 from ct_jax.interrupts import raise_if_interrupted
 from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import PlanTable, PrmConfig, RoadmapGuide, build_roadmap, draw_joined, extend, stack_tables
-from ct_jax.rollout import Controller, Guided, Steps, rollout
+from ct_jax.rollout import Controller, Guided, Steps, broke_off, rollout
 from ct_jax.trajectories import Trajectories, concatenate, select
 
 Guide = Literal["roadmap", "shortcut", "explorer"]
@@ -200,11 +200,12 @@ class Batch:
     real: np.ndarray  # bool [N]: false for copies, which are there so that the devices share the episodes evenly
 
     def outcome(self, state: State, steps: Steps) -> tuple[Trajectories, np.ndarray, np.ndarray]:
-        """This process's episodes, which of them succeeded, and which fell."""
-        ends = own({name: state.info[name] for name in ("goal", "success", "fall")}, data_mesh())
+        """This process's episodes, which of them succeeded, and which broke off: see ``rollout.broke_off``."""
+        ends = {name: state.info[name] for name in ("goal", "success")} | {"broken": broke_off(state.info)}
+        ends = own(ends, data_mesh())
         real = own_rows(self.real)
         data = to_trajectories(steps, ends["goal"], own_rows(self.maze))
-        return data, real & (ends["success"] > 0), real & (ends["fall"] > 0)
+        return data, real & (ends["success"] > 0), real & (ends["broken"] > 0)
 
 
 def draw_batch(

@@ -11,7 +11,7 @@ import numpy as np
 from brax.envs.base import State
 from scipy import stats
 
-from ct_envs import MazeEnv, UserError
+from ct_envs import MazeEnv, Tasks, UserError, check_tasks
 from ct_envs.maze import Maze, sample_pair
 from ct_envs.robots import Robot
 from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
@@ -19,7 +19,7 @@ from ct_jax.devices import data_mesh, fill_up, joined, own
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import Conditioned
 from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend
-from ct_jax.rollout import Controller, Guided, Policy, Steps
+from ct_jax.rollout import Controller, Guided, Policy, Steps, broke_off
 
 METHODS = ("ct", "planner", "explorer")
 GUIDED = ("planner", "explorer")  # what is led by a plan; everything else is a policy that was learned
@@ -47,9 +47,9 @@ class Episodes:
     success: np.ndarray  # bool [n]
     collided: np.ndarray  # bool [n]: touched a wall at any step
     fell: np.ndarray  # bool [n]
-    timeout: np.ndarray  # bool [n]
+    timeout: np.ndarray  # bool [n]: neither arrived nor broke off
     steps: np.ndarray  # [n]
-    returns: np.ndarray  # [n], raw; after a fall the robot lies where it is until the horizon
+    returns: np.ndarray  # [n], raw; after a fall, or where it diverged, the robot lies where it is until the horizon
     travelled_m: np.ndarray  # [n]
     path: np.ndarray  # float32 [T, n, 2]: positions, for pictures
     pairs: Pairs
@@ -61,6 +61,7 @@ class Episodes:
     grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
     not_joined: int | None = None  # of a planner: pairs that its roadmap does not join
     beyond: int = 0  # pairs too far apart for the robot to make within the horizon
+    diverged: np.ndarray | None = None  # bool [n]: a state or action was not finite, where that ends an episode
 
     def summary(self) -> dict[str, Any]:
         """Rates and means; intervals are 95 %: Wilson for rates, bootstrap over episodes for means."""
@@ -73,7 +74,8 @@ class Episodes:
         rows |= {"collision_rate": float(self.collided.mean()), "collision_ci95": wilson(self.collided)}
         rows |= {"fall_rate": float(self.fell.mean()), "fall_ci95": wilson(self.fell)}
         rows |= {"timeout_rate": float(self.timeout.mean()), "timeout_ci95": wilson(self.timeout)}
-        for name, told in (("frontal", self.frontal), ("grazing", self.grazing)):
+        for name in ("frontal", "grazing", "diverged"):
+            told = getattr(self, name)
             rows |= {} if told is None else {f"{name}_rate": float(told.mean()), f"{name}_ci95": wilson(told)}
         rows |= {"horizon": self.horizon, "beyond_horizon": self.beyond, "straight_ways": self.pairs.straight}
         rows |= {} if self.not_joined is None else {"not_joined": self.not_joined}
@@ -166,7 +168,11 @@ def evaluate(
         env: with maps, without auto-reset.
         method: "planner" (the full map, needs ``controller``), "explorer" (likewise), or any name for ``policy``.
         horizon: control steps of an episode; by default the environment's.
+
+    Raises:
+        UserError: pairs that are not of that maze.
     """
+    check_tasks(Tasks(pairs.start, pairs.goal, len(pairs.start)), maze)  # pyright: ignore[reportArgumentType]
     env = env.with_horizon(horizon or env.horizon)
     begun = time.perf_counter()
     order = fill_up(len(pairs.start), data_mesh())
@@ -209,17 +215,19 @@ def _outcome(
     env: MazeEnv, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: jax.Array | None
 ) -> Episodes:
     """What happened to the pairs, from the steps of each process's own."""
-    names = ("success", "fall", "position")
-    end = own({name: state.info[name] for name in names} | {"reward": state.reward, "asked": asked}, data_mesh())
-    success, fell = end["success"] > 0, end["fall"] > 0
+    names = ("success", "fall", "diverged", "position")
+    end = {name: state.info[name] for name in names} | {"broken": broke_off(state.info)}
+    end = own(end | {"reward": state.reward, "asked": asked}, data_mesh())
+    success, broken = end["success"] > 0, end["broken"] > 0
     alive, path = steps.alive, steps.position
     whole = np.concatenate([path, end["position"][None]])
-    lying = fell * end["reward"] * (env.horizon - alive.sum(0))
+    lying = broken * end["reward"] * (env.horizon - alive.sum(0))
     each = {
         "success": success,
         "collided": (steps.collision * alive).sum(0) > 0,
-        "fell": fell,
-        "timeout": ~success & ~fell,
+        "fell": end["fall"] > 0,
+        "diverged": end["diverged"] > 0,
+        "timeout": ~success & ~broken,
         "steps": alive.sum(0),
         "returns": (steps.reward * alive).sum(0) + lying,
         "travelled_m": np.linalg.norm(np.diff(whole, axis=0), axis=-1).sum(0),

@@ -154,34 +154,35 @@ def gather_recoveries(
     Args:
         envs: episodes of a wave, of at most ``horizon`` steps.
         wave: given the number of its first episode, this process's share of its episodes, which of them succeeded, and
-            which fell.
+            which broke off, by a fall or a fault.
 
     Raises:
         UserError: as ``recover``, NoRecoveryError included.
     """
     kept: list[Trajectories] = []
-    recoveries = episodes = falls = 0
+    recoveries = episodes = broken = 0
     while recoveries < config.recoveries:
         if episodes >= config.give_up * config.recoveries:
             break
-        data, rescued, fell = wave(episodes)
+        data, rescued, broke = wave(episodes)
         if config.keep == "relabelled":  # the transformer's own successes are told what is better, too, and its falls
-            data, rescued = lie_for_ever(data, fell, horizon), rescued | fell
+            data, rescued = lie_for_ever(data, broke, horizon), rescued | broke
         else:
             rescued = rescued & (data.learn.sum(1) > 0)
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
         recoveries, episodes = recoveries + int(joined(rescued).sum()), episodes + envs
-        falls += int(joined(fell).sum())
+        broken += int(joined(broke).sum())
         on_progress(recoveries, episodes)
     if not recoveries:
-        why = "it falls before it is helped" if 2 * falls > episodes else "the policy hardly fails"
-        raise NoRecoveryError(f"no recovery in {episodes} episodes, {falls} falls: {why}, so skip fine-tuning")
+        why = "it falls before it is helped" if 2 * broken > episodes else "the policy hardly fails"
+        raise NoRecoveryError(f"no recovery in {episodes} episodes, {broken} falls: {why}, so skip fine-tuning")
     return concatenate(kept)
 
 
-def lie_for_ever(data: Trajectories, fell: Bool[Array, "N"], horizon: int) -> Trajectories:
-    """The trajectories, with falls paid as if the robot lay there until the horizon: a short one is not a good one."""
-    row, last = np.flatnonzero(fell), np.asarray(data.length)[fell] - 1
+def lie_for_ever(data: Trajectories, broke: Bool[Array, "N"], horizon: int) -> Trajectories:
+    """The trajectories, with those that broke off paid as if the robot lay there until the horizon: a short one is not
+    a good one."""
+    row, last = np.flatnonzero(broke), np.asarray(data.length)[broke] - 1
     reward = np.array(data.reward)
     reward[row, last] *= horizon - last
     return data.replace(reward=reward)

@@ -43,13 +43,22 @@ class Steps:
 
     position: Float[Array, "T N 2"]
     proprio: Float[Array, "T N P"]
-    action: Float[Array, "T N A"]  # as meant
-    target: Float[Array, "T N A"]  # to be imitated
+    action: Float[Array, "T N A"]  # as meant; 0 where that is not finite
+    target: Float[Array, "T N A"]  # to be imitated; 0 where it is not finite
     reward: Float[Array, "T N"]
-    learn: Float[Array, "T N"]  # 1 where the action is to be imitated
+    learn: Float[Array, "T N"]  # 1 where the target is to be imitated and finite
     alive: Float[Array, "T N"]  # 1 where the episode was still running before the action
     success: Float[Array, "T N"]
     collision: Float[Array, "T N"]
+
+
+def broke_off(info: dict[str, Any]) -> Float[Array, "*b"]:
+    """1 where an episode ended by a fall or because something was not finite, else 0. (The last step's ``info``.)
+
+    Both end the losses of a robot that has not arrived. Wherever returns are compared they are paid alike: as if the
+    robot stayed where it is until the horizon.
+    """
+    return jnp.maximum(info["fall"], info["diverged"])
 
 
 @functools.partial(jax.jit, static_argnames=("env", "length", "mesh"))
@@ -70,13 +79,15 @@ def rollout(
         state, memory = carry
         action, memory = policy.act(memory, state, key)
         after = step(state, action.done)
+        # One number that is not finite, in a past action or in a target, would make all that is learned so.
+        usable = jnp.all(jnp.isfinite(action.target), -1)
         record = Steps(
             position=state.info["position"],
             proprio=state.obs["proprio"],  # pyright: ignore[reportArgumentType]
-            action=action.meant,
-            target=action.target,
+            action=jnp.where(jnp.isfinite(action.meant), action.meant, 0.0),
+            target=jnp.where(usable[:, None], action.target, 0.0),
             reward=after.reward,
-            learn=action.learn,
+            learn=jnp.where(usable, action.learn, 0.0),
             alive=1.0 - state.done,
             success=after.info["success"],
             collision=after.info["collision"],

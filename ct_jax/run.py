@@ -199,7 +199,7 @@ def _save_episodes(file: Path, episodes: Episodes) -> None:
     """Write what happened, for the report's pictures."""
     arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "fell", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
-    more = {"asked": episodes.asked, "frontal": episodes.frontal, "grazing": episodes.grazing}
+    more = {name: getattr(episodes, name) for name in ("asked", "frontal", "grazing", "diverged")}
     more |= {"world": episodes.pairs.world}
     arrays |= {name: array for name, array in more.items() if array is not None}
     np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

@@ -11,6 +11,7 @@ import json
 import multiprocessing
 import os
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Most of a test's time is XLA compiling a program that runs for milliseconds.
@@ -129,6 +130,32 @@ def push():
             return self.gain * jnp.clip(wanted / 4.0 + 0.5 * (wanted - proprio), -1.0, 1.0)
 
     return Push
+
+
+@pytest.fixture(scope="session")
+def faulty():
+    """A policy that stands still; from a step on, its action is no finite number in the environments it is given."""
+    import jax.numpy as jnp
+    from flax import struct
+
+    from ct_jax.rollout import act_as_meant
+
+    @struct.dataclass
+    class Faulty:
+        which: Any  # bool [N]
+        value: float = float("nan")
+        step: int = 3
+        size: int = struct.field(pytree_node=False, default=2)
+
+        def init(self, state, *_):
+            return jnp.zeros((), jnp.int32)
+
+        def act(self, memory, state, key):
+            bad = jnp.asarray(self.which) & (memory >= self.step)
+            action = jnp.zeros((*bad.shape, self.size))
+            return act_as_meant(action.at[:, -1].set(jnp.where(bad, self.value, 0.0))), memory + 1
+
+    return Faulty
 
 
 @pytest.fixture(scope="session")

@@ -53,6 +53,15 @@ def test_train_prints_the_table_and_where_things_are(tiny_run):
     assert "controller: done in" in tiny_run.stderr and "\x1b" not in tiny_run.stdout + tiny_run.stderr
 
 
+@pytest.mark.parametrize(("rates", "shown"), [([0.0, 0.0], False), ([0.0, 0.25], True), ([None, None], False)])
+def test_the_table_tells_of_divergence_only_where_there_was_some(capsys, rates, shown):
+    row = {"maze": "hall", "method": "ct", "success_rate": 0.5, "success_ci95": [0.1, 0.9], "spl": 0.5}
+    row |= {"return_scaled": -1.0, "collision_rate": 0.0, "steps_mean": 3.0}
+    cli.print_rows([row | ({} if rate is None else {"diverged_rate": rate}) for rate in rates])
+    out = capsys.readouterr().out
+    assert ("diverged %" in out) == shown and ("25" in out) == shown
+
+
 def test_json_is_the_only_thing_on_stdout(tiny_run, islands):
     """Through a real process, where libraries print what they like."""
     done = shell(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
 from ct_jax.collect import run_episodes
+from ct_jax.devices import data_mesh, fill_up
 from ct_jax.evaluate import (
     Episodes,
     Pairs,
@@ -287,3 +288,32 @@ def test_any_policy_can_be_evaluated():
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=40)
     done = evaluate(env, load_maze("antmaze-umaze"), two, "east", policy=East())
     assert done.success.tolist() == [True, False] and done.collided.tolist() == [False, True] and done.asked is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_is_counted_apart_and_paid_like_a_fall(faulty, bad):
+    """Three that stand still: one for all the time, one that breaks off in its fourth step, one at its goal."""
+    goal = np.float32([[12, 6], [12, 6], [6.2, 6]])
+    three = Pairs(np.float32([[6, 6]] * 3), goal, np.linalg.norm(goal - 6, axis=1), 0)
+    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=20)
+    n = len(fill_up(3, data_mesh()))
+    policy = faulty(jnp.arange(n) % 3 == 1, bad)
+    done = evaluate(env, load_maze("antmaze-umaze"), three, "faulty", policy=policy)
+    assert done.diverged.tolist() == [False, True, False] and not done.fell.any()
+    assert done.timeout.tolist() == [True, False, False] and done.success.tolist() == [False, False, True]
+    assert done.steps.tolist() == [20, 4, 1]
+    assert done.returns[1] == pytest.approx(done.returns[0], rel=1e-5)  # no better for having broken off
+    row = done.summary()
+    assert row["diverged_rate"] == row["timeout_rate"] == row["success_rate"] == pytest.approx(1 / 3)
+    low, high = row["diverged_ci95"]
+    assert low < 1 / 3 < high
+    assert np.isfinite(done.path).all()
+
+
+def test_pairs_of_another_maze_are_refused(pairs, push):
+    few = pairs["antmaze-large"]
+    for name, at in (("start", [2.0, 2.0]), ("goal", [np.nan, 6.0])):
+        wrong = getattr(few, name).copy()
+        wrong[3] = at
+        with pytest.raises(UserError, match=rf"{name}\[3\]"):
+            evaluate(ENV, MAZES["antmaze-large"], replace(few, **{name: wrong}), "planner", controller=push())

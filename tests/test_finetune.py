@@ -10,6 +10,7 @@ from flax import struct
 
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
+from ct_jax.devices import data_mesh, fill_up
 from ct_jax.finetune import RecoverConfig, Supervised, Watching, lie_for_ever, recover
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
@@ -212,3 +213,18 @@ def test_touching_walls_time_and_again_is_a_failure(push):
     past = jnp.full((CONFIG.stuck_steps, 3, 2), jnp.inf)
     memory = Watching(None, None, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(3, bool))
     np.testing.assert_array_equal(supervised._failed(memory, jnp.zeros((3, 2))), [False, True, False])
+
+
+def test_a_fault_is_paid_like_a_fall_and_teaches_nothing_that_is_no_number(push, faulty):
+    """Of standing still with a fault in step 4: relabelled, with the return of having stood there until the horizon."""
+    n = len(fill_up(N, data_mesh()))
+    own = faulty(jnp.ones(n, bool))
+    data = recoveries(own, push, keep="relabelled", recoveries=N)
+    finite = jax.tree.map(lambda leaf: bool(np.isfinite(leaf).all()), data)
+    assert all(jax.tree.leaves(finite)), finite
+    away = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=-1)
+    faults = np.asarray(data.length) == 4
+    assert faults.sum() >= N - 1  # but for a start at the goal
+    np.testing.assert_allclose(np.asarray(data.rtg)[faults, 0], -ENV.horizon * away[faults], rtol=1e-3)
+    with pytest.raises(UserError, match="it falls before it is helped"):
+        recoveries(own, push, keep="joined", recoveries=N)

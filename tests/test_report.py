@@ -189,6 +189,16 @@ def test_the_table_has_every_method_of_every_maze(whole):
     assert page.text.index(SEEN) < page.text.index(UNSEEN)
 
 
+@pytest.mark.parametrize(("rates", "shown"), [((0.0, 0.0), 0), ((0.0, 0.25), 1), ((None, None), 0), (("x", 0), 0)])
+def test_the_table_tells_of_divergence_only_where_there_was_some(make_run, rates, shown):
+    run = make_run()
+    rows = [make_row(name, "ct", 0.5) for name in (SEEN, UNSEEN)]
+    rows = [row | ({} if rate is None else {"diverged_rate": rate}) for row, rate in zip(rows, rates, strict=True)]
+    (run / "evaluate" / "results.json").write_text(json.dumps({"rows": rows}))
+    text, _ = read(run)
+    assert text.count('<th scope="col">Diverged</th>') == 2 * shown
+
+
 def test_every_failure_is_listed_and_marked(whole):
     text, page = whole
     assert len([row for row in page.rows if "stayed on one spot" in row]) == 7

@@ -8,7 +8,7 @@ from flax import struct
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
 from ct_jax.collect import run_episodes, start_episodes
-from ct_jax.rollout import Guided, act_as_meant, rollout
+from ct_jax.rollout import Guided, act_as_meant, broke_off, rollout
 
 N = 4
 ENV = MazeEnv("point", engine="mujoco", auto_reset=False, maps=False, horizon=9)
@@ -112,3 +112,15 @@ def test_without_compilation(start, push):
     with jax.disable_jit():
         plain = rollout(ENV, guided, start, memory, jax.random.key(0), 2)[2]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plain, compiled)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_is_neither_recorded_nor_imitated(start, faulty, bad):
+    which = jnp.array([False, False, True, False])
+    state, _, steps = rollout(ENV, faulty(which, bad), start, jnp.zeros((), jnp.int32), jax.random.key(0), 9)
+    jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), steps)
+    learn = np.asarray(steps.learn)
+    assert not learn[3:, 2].any() and learn[:3].all() and learn[:, ~which].all()
+    np.testing.assert_array_equal(steps.alive.sum(0), [1, 9, 4, 9])
+    np.testing.assert_array_equal(state.info["diverged"], which)
+    np.testing.assert_array_equal(broke_off(state.info), which)

@@ -213,6 +213,25 @@ def test_an_alive_bonus_is_all_that_a_fall_costs():
     assert same(sac._pay_falls(batch, jnp.array(0)), batch)
 
 
+def test_what_diverges_is_kept_and_paid_like_a_fall(monkeypatch, tmp_path, roadmap):
+    """Its last reward, what it costs for ever, and that nothing follows, even where arrivals end nothing."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
+    sac = make(replace(TINY, chain=True, through=True))
+    state = sac.create(jax.random.key(0), UMAZE, chain_tasks(split_edges(roadmap, 0.2, 0)[0], 0))
+    physics = state.env.pipeline_state
+    sick = state.env.replace(pipeline_state=physics.replace(qvel=physics.qvel.at[1, 0].set(jnp.inf)))
+    after, _ = sac._collect(state.replace(env=sick))
+    kept = sac._buffer._unflatten_fn(after.replay.data[: TINY.envs])
+    np.testing.assert_array_equal(after.env.info["diverged"], [0, 1, 0, 0])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(kept))
+    assert kept.reward[1] == after.env.reward[1] < 0  # minus the distance, as a fall's
+    drawn = sac._present(kept, jax.tree.map(lambda leaf: leaf[0], after.env.info["maze"]), jax.random.key(0))
+    np.testing.assert_array_equal(drawn.discount, [1, 0, 1, 1])
+    paid = sac._pay_falls(drawn, jnp.asarray(0)).reward
+    expected = (kept.reward[1] - TINY.fall_m[0]) / (1.0 - TINY.discount)
+    np.testing.assert_allclose(paid, kept.reward.at[1].set(expected), rtol=1e-5)
+
+
 def test_starts_turn_away_from_their_goals_bit_by_bit(roadmap):
     sac = make(replace(TINY, iterations=10, turn_ramp=(0.2, 0.6)), ANT)
     state = sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])

@@ -30,7 +30,7 @@ from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
-from ct_jax.rollout import Action, Controller, act_as_meant, rollout
+from ct_jax.rollout import Action, Controller, act_as_meant, broke_off, rollout
 
 Metres = Annotated[float, Within(0, 1_000_000)]  # and other prices of a step
 
@@ -360,7 +360,7 @@ class Sac:
             reward=reward,
             discount=1.0 - over,
             next_observation=self._observe(after),
-            extras={"state_extras": {"truncation": truncation, "fall": over * after.info["fall"]}},
+            extras={"state_extras": {"truncation": truncation, "fall": over * broke_off(after.info)}},
         )
         state = state.replace(
             key=key,
@@ -376,7 +376,8 @@ class Sac:
     def _reward(self, before: State, action: jax.Array, after: State) -> jax.Array:
         """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; bonuses.
 
-        Of a fall without an alive bonus it is minus the distance, whatever the robot's reward: see ``_pay_falls``.
+        Of a fall without an alive bonus it is minus the distance, whatever the robot's reward: see ``_pay_falls``. What
+        breaks off otherwise counts as a fall, here and there.
         """
         config = self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
@@ -387,7 +388,7 @@ class Sac:
         if config.action_cost:
             dense -= config.action_cost * jnp.mean(action**2, -1)
         dense += config.arrival_bonus * after.done * after.info["success"]
-        fall = after.done * after.info["fall"]
+        fall = after.done * broke_off(after.info)
         if config.alive_bonus:
             return dense + config.alive_bonus * (1.0 - fall)
         return jnp.where(fall > 0, after.reward, dense)

@@ -35,6 +35,7 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
     ("Frontal", "frontal_rate", "frontal_ci95", words.percent),
     ("Grazing", "grazing_rate", "grazing_ci95", words.percent),
     ("Falls", "fall_rate", "fall_ci95", words.percent),
+    ("Diverged", "diverged_rate", "diverged_ci95", words.percent),
     ("Time-outs", "timeout_rate", "timeout_ci95", words.percent),
     ("Mean steps", "steps_mean", "steps_ci95", lambda x: words.decimal(x, 0)),
 )
@@ -46,6 +47,7 @@ _GLOSSARY = {
     "Frontal": "share of episodes in which it ran into something ahead of it",
     "Grazing": "share of episodes in which it touched something with its side",
     "Falls": "share of episodes that ended with the robot on its side or back",
+    "Diverged": "share of episodes that ended because a state or an action was not a finite number",
     "Time-outs": "share of episodes that did not reach the goal in time",
 }
 CURVES = {  # what is drawn of a stage: the scalar, what it is, and how it is drawn
@@ -170,9 +172,14 @@ def _results(run: Run) -> str:
 
 
 def _columns(run: Run) -> list[tuple[str, str, str, Callable[[float], str]]]:
-    """The columns of the tables: contacts are told apart for some robots only."""
-    apart = ("frontal_rate", "grazing_rate")
-    return [column for column in _COLUMNS if column[1] not in apart or any(column[1] in row for row in run.rows)]
+    """The columns of the tables: contacts are told apart for some robots only, and hardly ever an episode diverges."""
+
+    def shown(key: str) -> bool:
+        if key in ("frontal_rate", "grazing_rate"):
+            return any(key in row for row in run.rows)
+        return key != "diverged_rate" or any(number(row.get(key)) for row in run.rows)
+
+    return [column for column in _COLUMNS if shown(column[1])]
 
 
 def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ct_envs.errors import UserError
     from ct_envs.maze import Maze, load_maze, make_maze, maze_names, random_walls, stack_mazes
-    from ct_envs.maze_env import MazeEnv, Tasks
+    from ct_envs.maze_env import FlatObservation, MazeEnv, Tasks, check_tasks
     from ct_envs.robots import ANT, HUMANOID, POINT, ROBOTS, Robot
 
 __all__ = [
-    "ANT", "HUMANOID", "POINT", "ROBOTS", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
-    "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes",
+    "ANT", "HUMANOID", "POINT", "ROBOTS", "FlatObservation", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
+    "check_tasks", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes",
 ]  # fmt: skip
 
 _NAMES = {
     "errors": ("UserError",),
     "maze": ("Maze", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes"),
-    "maze_env": ("MazeEnv", "Tasks"),
+    "maze_env": ("FlatObservation", "MazeEnv", "Tasks", "check_tasks"),
     "robots": ("ANT", "HUMANOID", "POINT", "ROBOTS", "Robot"),
 }
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
