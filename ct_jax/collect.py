@@ -94,7 +94,7 @@ def _reset(env: MazeEnv) -> Callable:
 def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Trajectories:
     """Turn the record of N episodes (time first) into trajectories with final goals.
 
-    The rewards are relabelled to the final goal (paper, sec. III-B): ``MazeEnv``'s are so from the start, whatever
+    The rewards are relabelled to the final goal (paper, sec. III-C): ``MazeEnv``'s are so from the start, whatever
     waypoints the controller followed.
     """
     swap = lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1)  # noqa: E731

@@ -1,4 +1,4 @@
-"""Collecting planner-guided episodes of the Turtlebot3 (paper, Algorithm 3 and sec. IV-D), on a pool of simulations."""
+"""Collecting planner-guided episodes of the Turtlebot3 (paper, Algorithm 3 and sec. IV-B), on a pool of simulations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

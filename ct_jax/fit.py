@@ -1,4 +1,4 @@
-"""Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-C).
+"""Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-D).
 
 The data lie in memory as arrays; a compiled step draws its own windows from them, recomputes their maps and updates the
 parameters, so the host does nothing but watch. Trajectories and batches are sharded over the devices of ``data_mesh``:
@@ -35,7 +35,7 @@ MODE_SPREAD = 0.05
 
 @dataclass(frozen=True)
 class FitConfig(Checked):
-    """One supervised training (paper, table II)."""
+    """One supervised training (paper, table I)."""
 
     updates: Count = 75_000
     batch: Annotated[int, Within(1, 1_000_000)] = 64  # pieces of trajectories
@@ -56,7 +56,7 @@ class FitConfig(Checked):
 
 @dataclass(frozen=True)
 class ValueConfig(Checked):
-    """The value network's training, and which trajectories it sees (paper, sec. III-C)."""
+    """The value network's training, and which trajectories it sees (paper, sec. III-D)."""
 
     fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
     top: Annotated[float, Above(0, 1)] = 1.0  # only the best share X of the trajectories, by return over the straight
@@ -144,7 +144,7 @@ def _matrices(params: Any) -> Any:
 
 
 def transformer_loss(model: ControlTransformer) -> Loss:
-    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-C).
+    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-D).
 
     Of several modes, minus the logarithm of the likelihood of a mixture of Gaussians around them, scaled such that of a
     single one the squared error is left.
@@ -164,7 +164,7 @@ def transformer_loss(model: ControlTransformer) -> Loss:
 
 
 def value_loss(model: ValueNetwork) -> Loss:
-    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-C)."""
+    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-D)."""
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
         del key

@@ -33,7 +33,7 @@ NO_HOP = -1  # entry of the next-hop table where there is no path
 
 @dataclass(frozen=True)
 class PrmConfig(Checked):
-    """How roadmaps are sampled (paper, sec. III-F)."""
+    """How roadmaps are sampled (paper, sec. III-G)."""
 
     samples: Annotated[int, Within(2, 20_000)] = 200  # n; as many again follow until the roadmap joins starts and goals
     connect_m: Annotated[float, Above(0, 10_000)] = 10.0  # d: longest edge [m]

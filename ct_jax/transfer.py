@@ -1,4 +1,4 @@
-"""Transfer to another robot (paper, sec. IV-E): what was learned of mazes stays, what is the body's begins anew."""
+"""Transfer to another robot (paper, sec. IV-A): what was learned of mazes stays, what is the body's begins anew."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The value network V_phi(s | g): the mean return of the data from a first observation (paper, sec. III-C, E)."""
+"""The value network V_phi(s | g): the mean return of the data from a first observation (paper, sec. III-D and III-F)."""
 
 import flax.linen as nn
 import jax.numpy as jnp

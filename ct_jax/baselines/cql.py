@@ -1,4 +1,4 @@
-"""PT-CQL: conservative Q-learning on the planner-guided trajectories (paper, sec. IV-B; Kumar et al., 2020).
+"""PT-CQL: conservative Q-learning on the planner-guided trajectories (paper, sec. IV-A; Kumar et al., 2020).
 
 The same trajectories, final goals and reward -||g|| as for the transformer, as single steps (s, a, r, s'). An episode
 is over at its goal and nowhere else. What the critics say of actions that the data do not hold is pushed down: CQL(H),

@@ -1,4 +1,4 @@
-"""SAC alone: the controller's learner with the whole maze as its task, without planner or data (paper, sec. IV-B).
+"""SAC alone: the controller's learner with the whole maze as its task, without planner or data (paper, sec. IV-A).
 
 It sees what the transformer sees, its starts and goals lie anywhere in the maze, its reward is minus the distance to
 the goal, and an episode lasts as long as the robot's. The replay keeps positions; the maps are recomputed from them,

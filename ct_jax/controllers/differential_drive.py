@@ -1,4 +1,4 @@
-"""The known controller of a differential-drive robot (paper, sec. IV-D): nothing is learned, only the goal is seen."""
+"""The known controller of a differential-drive robot (paper, sec. IV-B): nothing is learned, only the goal is seen."""
 
 from dataclasses import dataclass
 

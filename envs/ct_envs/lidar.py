@@ -1,4 +1,4 @@
-"""The local occupancy map of a lidar (paper, sec. IV-D). NumPy only: simulations' processes start without jax.
+"""The local occupancy map of a lidar (paper, sec. IV-B). NumPy only: simulations' processes start without jax.
 
 Its cells are those of ``ct_envs.occupancy``, where the map of a maze is drawn.
 """
@@ -12,7 +12,7 @@ from ct_envs.errors import UserError
 
 MAP_CELLS = 25  # k of the paper
 LIDAR_BEAMS = 360  # of the Turtlebot3's LDS-01: one a degree, counter-clockwise from the heading
-LIDAR_RANGE_M = 1.0  # what we use of its 3.5 m (paper, sec. IV-D)
+LIDAR_RANGE_M = 1.0  # what we use of its 3.5 m (paper, sec. IV-B)
 LIDAR_CELL_M = 0.08  # so that the window just holds the range
 
 
@@ -27,7 +27,7 @@ def lidar_map(
     beams: int = LIDAR_BEAMS,
     missing_ok: bool = False,
 ) -> UInt8[np.ndarray, "*b 2 k k"]:
-    """The local map of a lidar: channel 0 is 1 in the cells in which beams end, channel 1 in the goal's (sec. IV-D).
+    """The local map of a lidar: channel 0 is 1 in the cells in which beams end, channel 1 in the goal's (sec. IV-B).
 
     Args:
         ranges: [*b, beams] (m); beam i is ``360 i / beams`` degrees to the left of the heading. One of ``range_m`` or

@@ -1,4 +1,4 @@
-"""The 2 x k x k local occupancy map, the only thing a policy sees of the walls (paper, sec. IV-A and IV-D).
+"""The 2 x k x k local occupancy map, the only thing a policy sees of the walls (paper, sec. IV-A and IV-B).
 
 The window is centred on the robot and aligned with the world. ``map[channel, i, j]`` is the point
 ``(j - (k - 1) / 2, i - (k - 1) / 2) * cell_m`` from the robot, so ``i`` runs up (y) and ``j`` right (x). Channel 0 is
