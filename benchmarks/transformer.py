@@ -2,7 +2,7 @@
 
     python benchmarks/transformer.py [--full]
 
-*turtlebot3* is 4 layers of 128, K=5, batch 128; *ant* is 4 layers of 512, K=50, batch 64 (paper, table II). Ours is the
+*turtlebot3* is 4 layers of 128, K=5, batch 128; *ant* is 4 layers of 512, K=50, batch 64 (paper, table I). Ours is the
 step as it is trained with, in a ``scan``: windows drawn from trajectories, their maps recomputed, gradient, clipping,
 AdamW. The peer is Hugging Face's Decision Transformer in torch (same widths, batch, and a CNN as ours in front), on one
 batch that lies ready. The third contestant is a matrix product: the ratio is the share of its FLOP/s that our step

@@ -30,10 +30,10 @@ class CollectConfig(Checked):
 
     trajectories: Count = 1000  # T: successes to collect
     reset_interval: Count = 25  # L: episodes on one roadmap
-    guide: Guide = "roadmap"  # whose plan: "roadmap" point by point, "shortcut" over it, "explorer" (knows no map)
+    guide: Guide = "roadmap"  # planner: "roadmap" point by point, "shortcut" to visible points, "explorer" without map
     starts: Literal["vertices", "maze"] = "vertices"  # starts and goals: roadmap "vertices" (paper) or free points of
     # the "maze"
-    noise: Annotated[float, Within(0, 100)] = 0.0  # size of a disturbance of the actions that is not imitated
+    noise: Annotated[float, Within(0, 100)] = 0.0  # standard deviation of a disturbance of actions; it is not imitated
     envs: Annotated[int, Within(1, 100_000)] = 250  # episodes at a time
     horizon: Annotated[int, Within(1, 1_000_000)] = 400  # steps of an episode
     give_up: Annotated[float, Above(0, 1_000_000)] = 10.0  # stop after this many times T episodes
@@ -50,11 +50,11 @@ def run_episodes(
     limit: int,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[State, object, Steps]:
-    """Roll out until all episodes are over, or ``limit`` steps, in compiled chunks.
+    """Roll out until all episodes are over, at most ``limit`` steps, in compiled chunks.
 
     Args:
         state: from ``start_episodes``.
-        on_progress: told (steps, episodes that are over) after every ``chunk``.
+        on_progress: called with (steps, finished episodes) after every ``chunk``.
 
     Returns:
         The last state and memory, and the steps of this process's own episodes as NumPy [T, n, ...].
@@ -76,7 +76,7 @@ def run_episodes(
 def start_episodes(env: MazeEnv, keys: jax.Array, maze: Maze, start: jax.Array, goal: jax.Array) -> State:
     """States of N episodes with the given keys [N], mazes (leading axis N), starts and goals [N, 2] (m).
 
-    The devices share them, so there must be as many as ``fill_up`` says.
+    The devices share them evenly, so N must be a length that ``fill_up`` gives.
     """
     n = len(start)
     tasks = Tasks(start[:, None], goal[:, None], jnp.ones(n, jnp.int32))
@@ -95,8 +95,8 @@ def _reset(env: MazeEnv) -> Callable:
 def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Trajectories:
     """Turn the record of N episodes (time first) into trajectories with final goals.
 
-    The rewards are relabelled to the final goal (paper, sec. III-B): ``MazeEnv``'s are so from the start, whatever
-    waypoints the controller followed.
+    Rewards are those of the final goal (paper, sec. III-C). ``MazeEnv`` already gives them: its reward does not depend
+    on the waypoints that the controller followed.
     """
     swap = lambda leaf: np.swapaxes(np.asarray(leaf), 0, 1)  # noqa: E731
     length = np.asarray(steps.alive).sum(0).astype(np.int32)
@@ -115,7 +115,7 @@ def to_trajectories(steps: Steps, goal: np.ndarray, maze: np.ndarray) -> Traject
 
 
 def make_guide(name: Guide, env: MazeEnv, prm: PrmConfig) -> RoadmapGuide | ExplorerGuide:
-    """The guide of that name."""
+    """The guide with this name."""
     radius, cell_m = env.robot.radius_m, env.engine.cell_m
     if name == "explorer":
         return ExplorerGuide(radius + prm.margin_m, env.map_cell_m, cell_m, prm.connect_m)
@@ -137,11 +137,11 @@ def collect(
 
     Args:
         env: without auto-reset and maps, with ``config.horizon``.
-        mazes: stacked; each roadmap takes the next one.
-        on_progress: told (successes, episodes) so far.
+        mazes: stacked; each new roadmap is in the next maze.
+        on_progress: called with (successes, episodes) so far.
 
     Raises:
-        UserError: too few successes within ``give_up * T`` episodes, or names that mean nothing.
+        UserError: too few successes within ``give_up * T`` episodes.
     """
     policy = Guided(controller, make_guide(config.guide, env, prm), config.noise)
 
@@ -163,11 +163,11 @@ def gather(
     """The loop of Algorithm 3: episodes, wave after wave, until T have succeeded; only successes are kept.
 
     Args:
-        wave: given the number of its first episode, this process's share of ``config.envs`` episodes, the same for
-            all, and which of them succeeded.
+        wave: a function of the index of its first episode. It returns this process's share of ``config.envs`` episodes
+            (all shares are equal), and which of them succeeded.
 
     Returns:
-        This process's share.
+        This process's share of the successes.
 
     Raises:
         UserError: too few successes within ``give_up * T`` episodes.
@@ -177,8 +177,8 @@ def gather(
     while successes < config.trajectories:
         if episodes >= config.give_up * config.trajectories:
             raise UserError(
-                f"the controller reached only {successes} of {episodes} goals, {config.trajectories} were asked for; "
-                "train it longer or look at its success on edges"
+                f"the controller reached only {successes} of {episodes} goals, but {config.trajectories} are needed; "
+                "train it longer or check its success on edges"
             )
         data, won = wave(episodes)
         everyone = joined(won)
@@ -197,7 +197,7 @@ class Batch:
     tables: PlanTable  # leading axis: roadmaps
     which: jax.Array  # int32 [N]: roadmap of each episode
     maze: np.ndarray  # int [N]: maze of each episode
-    real: np.ndarray  # bool [N]: false for copies, which are there so that the devices share the episodes evenly
+    real: np.ndarray  # bool [N]: false for copies; these make the number even for all devices
 
     def outcome(self, state: State, steps: Steps) -> tuple[Trajectories, np.ndarray, np.ndarray]:
         """This process's episodes, which of them succeeded, and which broke off: see ``rollout.broke_off``."""
@@ -211,16 +211,16 @@ class Batch:
 def draw_batch(
     key: jax.Array, env: MazeEnv, mazes: Maze, config: CollectConfig, prm: PrmConfig, *, first_maze: int = 0
 ) -> Batch:
-    """Fresh roadmaps, one for every ``reset_interval`` episodes, maze after maze, and episodes on them."""
+    """New roadmaps, one for every ``reset_interval`` episodes, maze after maze, and the first states of episodes."""
     n_maps = max(1, config.envs // config.reset_interval)
     per_map = -(-config.envs // n_maps)
     maze_of_map = (first_maze + np.arange(n_maps)) % mazes.walls.shape[0]
     keys = jax.random.split(key, n_maps + 1)
-    # Each process builds its share of the roadmaps, and tells the others.
+    # Each process builds its share of the roadmaps and sends it to the others.
     mine = np.array_split(np.arange(n_maps), jax.process_count())[jax.process_index()]
     drawn = [
         _endpoints(keys[i], jax.tree.map(lambda leaf, m=maze_of_map[i]: leaf[m], mazes), env, config, prm, per_map)
-        for i in (mine if len(mine) else [0])  # without a share, one for its shapes
+        for i in (mine if len(mine) else [0])  # a process without a share builds one, for the shapes of its arrays
     ]
     tables, start, goal = zip(*drawn, strict=True)
     start, goal = (joined(np.stack(ends)[: len(mine)]) for ends in (start, goal))
@@ -235,7 +235,7 @@ def draw_batch(
 
 
 def plan_memory(guide: RoadmapGuide | ExplorerGuide, tables: PlanTable, which: jax.Array, state: State) -> object:
-    """The guide's memory at the start of episodes (or wherever the robots are now)."""
+    """The guide's memory for robots at their present positions: at the start of episodes, or later."""
     maze, position, goal = (state.info[name] for name in ("maze", "position", "goal"))
     if isinstance(guide, ExplorerGuide):
         return guide.init(maze)
@@ -250,13 +250,13 @@ def _plan(guide: RoadmapGuide, tables: PlanTable, which: jax.Array, maze: Maze, 
 def _endpoints(
     key: jax.Array, maze: Maze, env: MazeEnv, config: CollectConfig, prm: PrmConfig, n: int
 ) -> tuple[PlanTable, jax.Array, jax.Array]:
-    """A fresh roadmap, and n starts and goals [n, 2] (m) that it connects."""
+    """A new roadmap, and n starts and goals [n, 2] (m) that it connects."""
     map_key, pair_key = jax.random.split(key)
     build = functools.partial(build_roadmap, map_key, maze, radius_m=env.robot.radius_m, config=prm)
     if config.starts == "maze":
         pairs = jax.vmap(lambda k: sample_pair(k, maze, radius=env.robot.radius_m))(jax.random.split(pair_key, n))
         ends = np.stack(pairs, 1)
-        if config.guide == "explorer":  # which asks no roadmap: any table does
+        if config.guide == "explorer":  # it uses no roadmap, so any table will do
             return build(ends=ends[:0]).table, *pairs
         roadmap = build(ends=ends)
         goals = np.arange(n) + len(roadmap.points)

@@ -1,4 +1,4 @@
-"""Collecting planner-guided episodes of the Turtlebot3 (paper, Algorithm 3 and sec. IV-D), on a pool of simulations."""
+"""Collecting planner-guided episodes of the Turtlebot3 (paper, Algorithm 3 and sec. IV-B), on a pool of simulations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,41 +25,41 @@ from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
 MAX_WORLDS = 1000
-MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # of obstacles against training
-_PAIRS = 200  # starts and goals that are tried in one world
-_APART_M = 1.0  # least distance of start and goal
-_LOOK = 24  # waypoints that are looked at first: mostly one of the best is in sight
+MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # obstacle density relative to training
+_PAIRS = 200  # number of starts and goals that are tried in one world
+_APART_M = 1.0  # smallest distance between start and goal
+_LOOK = 24  # number of waypoints checked first: usually one of the best is visible
 _NUDGE_M = 1e-3
-_CLEAR_M = 0.05  # that the explorer keeps to what it saw, half a cell of its grid included
+_CLEAR_M = 0.05  # distance that the explorer keeps to obstacles; includes half a cell of its grid
 
 
 @dataclass(frozen=True)
 class RoomConfig(Checked):
     """The rooms of training and evaluation."""
 
-    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # of obstacles in training: 1 is what the published numbers
-    # are measured in
-    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # with this, each room's density is its own, between
-    # the two
+    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # density of obstacles in training; the published numbers
+    # are measured at 1
+    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # if given, each room's density is drawn between
+    # ``density`` and this
     noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of sensor and motion noise in training; 1 is that of a
     # real robot
-    worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # rooms of the evaluation (paper)
+    worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # number of evaluation rooms (paper)
 
     @property
     def densities(self) -> tuple[float, float]:
-        """Between which the densities of the rooms of training are drawn."""
+        """The range from which the densities of the training rooms are drawn."""
         return self.density, self.density if self.densest is None else self.densest
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A world and a roadmap of it, which serve ``reset_interval`` episodes."""
+    """A world and its roadmap, used for ``reset_interval`` episodes."""
 
     world: World
     roadmap: Roadmap
 
     def draw(self, rng: np.random.Generator, starts: str = "vertices") -> tuple[np.ndarray, np.ndarray]:
-        """A start and a goal [2] (m) that the roadmap joins. Raises UserError if it joins no two."""
+        """A start and a goal [2] (m) that the roadmap joins. Raises UserError if none is found."""
         for _ in range(_PAIRS):
             if starts == "maze":
                 start, goal = self.world.sample_pair(rng, RADIUS_M, apart_m=_APART_M)
@@ -70,11 +70,11 @@ class Room:
             start, goal = self.roadmap.points[[first, last]]
             if np.linalg.norm(start - goal) >= _APART_M and nx.has_path(self.roadmap.graph, first, last):
                 return start, goal
-        raise UserError("the roadmap joins no start and goal in this world; use fewer obstacles or more samples")
+        raise UserError("the roadmap joins no start and goal in this room; use fewer obstacles or more samples")
 
 
 def make_room(key: jax.Array, prm: PrmConfig, *, densities: tuple[float, float] = (1.0, 1.0)) -> Room:
-    """A random world and its roadmap, by their key; its density, as for ``clutter``, is uniform between the two."""
+    """A random world and its roadmap. Its density (see ``clutter``) is uniform between the two ``densities``."""
     world_key, map_key = jax.random.split(key)
     seed = tuple(np.asarray(jax.random.key_data(world_key)).astype(np.uint32).tolist())
     low, high = densities
@@ -83,8 +83,8 @@ def make_room(key: jax.Array, prm: PrmConfig, *, densities: tuple[float, float] 
 
 
 def clutter(seed: int | tuple[int, ...], density: float) -> World:
-    """A random world ``density`` times as full as those of training. Raises UserError as ``random_world``."""
-    share = np.random.default_rng(seed).uniform(*TRAIN_DENSITY)  # what ``random_world`` draws by itself
+    """A random world with ``density`` times the obstacles of training. Raises UserError like ``random_world``."""
+    share = np.random.default_rng(seed).uniform(*TRAIN_DENSITY)  # the same draw as in ``random_world``
     return random_world(seed, density * share)
 
 
@@ -92,20 +92,20 @@ def clutter(seed: int | tuple[int, ...], density: float) -> World:
 
 
 class Following(NamedTuple):
-    """Where N robots are on their ways."""
+    """The plans of N robots and their current waypoints."""
 
-    points: Float[np.ndarray, "N L 2"]  # waypoints, the last repeated [m]
-    at: np.ndarray  # int [N]: waypoint they head for
+    points: Float[np.ndarray, "N L 2"]  # waypoints, padded by repeating the last one [m]
+    at: np.ndarray  # int [N]: index of the current waypoint
 
 
 @dataclass(frozen=True)
 class WayGuide:
-    """The roadmap's shortest way from start to goal, point after point (paper, sec. III-A)."""
+    """The roadmap's shortest path from start to goal, point after point (paper, sec. III-A)."""
 
-    waypoint_tolerance_m: float = 0.06  # who turns off earlier cuts the corner
+    waypoint_tolerance_m: float = 0.06  # a robot that turns earlier cuts the corner
 
     def init(self, frame: Frame, episodes: Sequence[Episode], rooms: Sequence[Room]) -> Following:
-        """At the beginning of the ways of the first slots."""
+        """The plans of the first slots, at their beginnings."""
         plans = [room.roadmap.plan(each.start, each.goal) for each, room in zip(episodes, rooms, strict=True)]
         ways = [
             np.stack([each.start, each.goal]) if isinstance(plan, NoPath) else plan.points
@@ -118,7 +118,7 @@ class WayGuide:
         return Following(points, np.full(n, min(1, longest - 1)))
 
     def waypoint(self, memory: Following, frame: Frame) -> tuple[np.ndarray, Following]:
-        """Vectors to the robots' waypoints [N, 2] (m), each passed once it is reached."""
+        """Vectors to the robots' waypoints [N, 2] (m), and the plans after this step."""
         row, last = np.arange(len(memory.at)), memory.points.shape[1] - 1
         away = np.linalg.norm(memory.points[row, memory.at] - frame.position, axis=-1)
         at = np.where(away < self.waypoint_tolerance_m, np.minimum(memory.at + 1, last), memory.at)
@@ -126,25 +126,26 @@ class WayGuide:
 
 
 class Field(NamedTuple):
-    """One robot's roadmap, seen from its goal, which is the last of its points."""
+    """One robot's roadmap with the path lengths to its goal. The goal is the last point."""
 
     world: World
     points: Float[np.ndarray, "n 2"]  # [m]
-    to_go: Float[np.ndarray, "n"]  # way to the goal [m]
+    to_go: Float[np.ndarray, "n"]  # path length to the goal [m]
     target: Float[np.ndarray, "2"]  # [m]
 
 
 @dataclass(frozen=True)
 class ShortcutGuide:
-    """At every step the point in sight that makes the shortest way to the goal, as ``prm.RoadmapGuide`` does: smoother
-    than the roadmap's way, and it recovers from any disturbance."""
+    """At every step the visible point with the shortest path to the goal, like ``prm.RoadmapGuide`` with ``shortcut``.
 
-    margin_m: float  # kept beyond the robot's radius, where the robot itself has as much room
-    look_m: float = 2.0  # farthest waypoint
-    waypoint_tolerance_m: float = 0.05  # a nearer one is passed: the controller would come to rest there
+    It is smoother than the roadmap's path and recovers from any disturbance."""
+
+    margin_m: float  # clearance beyond the robot's radius, if the robot itself has that much room
+    look_m: float = 2.0  # largest distance of a waypoint
+    waypoint_tolerance_m: float = 0.05  # a nearer waypoint is skipped: the controller would stop there
 
     def init(self, frame: Frame, episodes: Sequence[Episode], rooms: Sequence[Room]) -> tuple[Field, ...]:
-        """The goals joined to their roadmaps."""
+        """The roadmaps, connected to the goals."""
         return tuple(self._field(each, room) for each, room in zip(episodes, rooms, strict=True))
 
     def _field(self, episode: Episode, room: Room) -> Field:
@@ -155,7 +156,7 @@ class ShortcutGuide:
         return Field(room.world, np.concatenate([points, goal[None]]), np.append(to_go, 0.0), goal)
 
     def waypoint(self, memory: tuple[Field, ...], frame: Frame) -> tuple[np.ndarray, tuple[Field, ...]]:
-        """Vectors to the robots' waypoints [N, 2] (m)."""
+        """Vectors to the robots' waypoints [N, 2] (m), and the memory after this step."""
         fields = [
             field if frame.done[slot] else field._replace(target=self._choose(field, frame.position[slot]))
             for slot, field in enumerate(memory)
@@ -165,12 +166,12 @@ class ShortcutGuide:
         return to_heading(target - frame.position, frame.yaw_rad), tuple(fields)
 
     def _choose(self, field: Field, position: np.ndarray) -> np.ndarray:
-        """The best point in sight; where there is none, what the robot headed for."""
+        """The best visible point; if none is visible, the previous target."""
         away = np.linalg.norm(field.points - position, axis=-1)
         passed = (away < self.waypoint_tolerance_m) & (field.to_go > 0)
         way = np.where((away <= self.look_m) & ~passed, away + field.to_go, np.inf)
         best = np.argsort(way)[: int(np.isfinite(way).sum())]
-        # Beside a waypoint that is passed, the way on may have a little less room than it has from there.
+        # The robot is not exactly on a skipped waypoint, so its path may have a little less room than the roadmap's.
         slack = self.waypoint_tolerance_m if passed.any() else 0.0
         for some in (best[:_LOOK], best[_LOOK:]):
             free = np.flatnonzero(self._sees(field.world, position, field.points[some], slack))
@@ -179,8 +180,9 @@ class ShortcutGuide:
         return field.target
 
     def _sees(self, world: World, position: np.ndarray, points: np.ndarray, slack_m: float = 0.0) -> np.ndarray:
-        """Whether the ways from a position [2] to points [k, 2] (m) are free; one that is near an obstacle already may
-        stay as near."""
+        """Whether the straight lines from a position [2] to points [k, 2] (m) are free.
+
+        If an end is already close to an obstacle, the line may be as close."""
         ends = np.minimum(world.clearance(points), float(world.clearance(position))) - _NUDGE_M
         room = np.minimum(ends, RADIUS_M + max(self.margin_m - slack_m, 0.0))
         return world.segment_free(np.stack(np.broadcast_arrays(position, points), -2), room)
@@ -195,7 +197,7 @@ _GUIDES: dict[Guide, Callable[[PrmConfig], AnyGuide]] = {
 
 
 def make_guide(name: Guide, prm: PrmConfig) -> AnyGuide:
-    """The guide of that name."""
+    """The guide with this name."""
     return _GUIDES[name](prm)
 
 
@@ -203,7 +205,7 @@ def make_guide(name: Guide, prm: PrmConfig) -> AnyGuide:
 
 
 class Wave(NamedTuple):
-    """Episodes to be driven at the same time, and the rooms they are in."""
+    """Episodes that are driven at the same time, and their rooms."""
 
     episodes: list[Episode]
     rooms: list[Room]
@@ -213,7 +215,7 @@ def draw_wave(
     key: jax.Array, first: int, config: CollectConfig, prm: PrmConfig, *, n: int,
     densities: tuple[float, float] = (1.0, 1.0),
 ) -> Wave:  # fmt: skip
-    """Episodes ``first`` to ``first + n - 1``, a new room every L. Each depends on the key and its number alone."""
+    """Episodes ``first`` to ``first + n - 1``, a new room every L. Each depends only on the key and its number."""
     room_key, episode_key = jax.random.split(key)
     numbers = range(first, first + n)
     which = [number // config.reset_interval for number in numbers]
@@ -230,7 +232,7 @@ def drive_guided(
     pool: Turtlebot3Pool, wave: Wave, guide: AnyGuide, controller: DifferentialDrive = DifferentialDrive(), *,
     noise: float = 0.0,
 ) -> list[Drive]:  # fmt: skip
-    """Drive a wave led by a guide."""
+    """Drive a wave of episodes with a guide."""
     driver = GuidedDriver(guide, controller, noise)
 
     def begin(frame: Frame) -> Any:
@@ -251,13 +253,14 @@ def collect(
     on_progress: Callable[[int, int], None] = lambda successes, episodes: None,
     keep: Callable[[Callable[[int], Any]], Callable[[int], Any]] = lambda wave: wave,
 ) -> Trajectories:
-    """Algorithm 3: drive along plans until T episodes have succeeded, a new world and roadmap every L; only successes.
+    """Algorithm 3: drive along plans until T episodes have succeeded; only successes are kept.
 
-    ``config.envs`` episodes are driven at a time; ``config.horizon`` is the pool's business.
+    Every L episodes, the world and roadmap are new. ``config.envs`` episodes are driven at a time.
 
     Args:
-        densities: of obstacles, as for ``make_room``.
-        on_progress: told (successes, episodes) so far.
+        pool: its horizon must be ``config.horizon``.
+        densities: of obstacles, see ``make_room``.
+        on_progress: called with (successes, episodes) so far.
         keep: see ``keeping``.
 
     Raises:
@@ -266,7 +269,7 @@ def collect(
     if config.envs > pool.n or config.horizon != pool.config.horizon:
         raise UserError(
             f"{config.envs} episodes of {config.horizon} steps do not fit a pool of {pool.n} with horizon "
-            f"{pool.config.horizon}; give both the same"
+            f"{pool.config.horizon}; use the same numbers for both"
         )
     guide = make_guide(config.guide, prm)
 
@@ -279,18 +282,18 @@ def collect(
 
 
 def _are_flags(found: Any, kinds: int, n: int) -> bool:
-    """Whether a value is a list of as many lists of n flags as there are kinds."""
+    """Whether a value is a list of ``kinds`` lists of n flags."""
     lists = [found, *found] if isinstance(found, list) else [found]
     sizes = [len(each) if isinstance(each, list) else None for each in lists]
     return sizes == [kinds, *[n] * kinds] and all(isinstance(flag, bool) for each in found for flag in each)
 
 
 def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
-    """Waves that are written down in a folder and, after an interruption, read back instead of driven again.
+    """Save each wave in a folder. After an interruption, read the saved waves back instead of driving them again.
 
     Args:
-        kinds: of flags that a wave has besides its trajectories.
-        mend: what the error tells a person to do about a damaged file.
+        kinds: number of flag arrays that a wave has besides its trajectories.
+        mend: the advice in the error about a damaged file.
     """
     folder.mkdir(parents=True, exist_ok=True)
 
@@ -302,7 +305,7 @@ def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int],
                 write_json(flags_file, {"flags": [flag.tolist() for flag in flags]})
                 part = folder / "part.npz"
                 save(data, part)
-                part.replace(file)  # last: it says that all is there
+                part.replace(file)  # last: this file shows that the wave is complete
             try:
                 data = load(file)
             except UserError as bad:

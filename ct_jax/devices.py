@@ -1,10 +1,10 @@
-"""Several devices and several processes: the one mesh, what lies where on it, and what processes tell each other.
+"""Several devices and several processes: the mesh, the placement of arrays on it, and messages between processes.
 
-Every process runs the same program on the whole mesh. What is sharded lies along its one axis, "data", in the order of
-the processes; everything else every process has whole. Files are process 0's, and so are decisions that depend on
-files, clocks or signals: processes that decided apart would wait for each other for ever.
+Every process runs the same program on the whole mesh. The mesh has one axis, "data". Sharded arrays are split along it
+in the order of the processes; all other arrays are whole in every process. Only process 0 writes files and decides what
+depends on files, clocks or signals: processes that decide differently would wait for each other for ever.
 
-With one process all of this is the identity.
+With one process, all of these functions are the identity.
 """
 
 import json
@@ -45,43 +45,44 @@ def start(coordinator: str | None, processes: int | None, process: int | None) -
 
 
 def is_first() -> bool:
-    """Whether this is process 0, which speaks and writes for all."""
+    """Whether this is process 0. Only process 0 prints and writes files."""
     return jax.process_index() == 0
 
 
-# ------------------------------------------------------------------------------------------------- what lies where
+# ---------------------------------------------------------------------------------------------- placement of arrays
 
 
 def data_mesh(batch: int | None = None) -> Mesh:
-    """All devices along one axis, "data", process after process; or, equally many of each process, as many as share a
-    batch evenly.
+    """All devices along one axis, "data", process after process.
+
+    With ``batch``: only as many devices as can share the batch evenly, the same number in each process.
 
     Raises:
-        UserError: the processes cannot share the batch.
+        UserError: the processes cannot share the batch evenly.
     """
     devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
     count = Counter(device.process_index for device in devices)
     each = min(count.values())
     if batch is not None:
         if batch % len(count):
-            raise UserError(f"a batch of {batch} cannot be shared by {len(count)} processes; start a number that can")
+            raise UserError(f"{len(count)} processes cannot share a batch of {batch} evenly; start a number that can")
         each = max(n for n in range(1, each + 1) if batch % (n * len(count)) == 0)
     first = np.cumsum([0, *count.values()])[:-1]
     return Mesh(np.array([devices[i + j] for i in first for j in range(each)]), (AXIS,))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """The same on every device."""
+    """A sharding with the whole array on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def sharded(mesh: Mesh, axis: int = 0) -> NamedSharding:
-    """Split along an axis of the arrays."""
+    """A sharding that splits the arrays along an axis."""
     return NamedSharding(mesh, PartitionSpec(*[None] * axis, AXIS))
 
 
 def place(tree: Tree, sharding: NamedSharding) -> Tree:
-    """Put arrays, which every process has whole, onto the mesh."""
+    """Put arrays onto the mesh. Every process has them whole."""
 
     def put(leaf: Any) -> jax.Array:
         if sharding.is_fully_addressable:
@@ -95,43 +96,43 @@ def place(tree: Tree, sharding: NamedSharding) -> Tree:
 
 
 def feed(tree: Tree, mesh: Mesh) -> Tree:
-    """Put the rows that each process has of arrays onto its own devices; all processes have equally many."""
+    """Put each process's own rows onto its devices, as one sharded array. All processes have equally many rows."""
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharded(mesh), leaf), tree)
 
 
 def alike(state: Tree) -> Tree:
-    """A state that every process computes for itself, in the form in which several processes save one state."""
+    """A state that every process computed for itself, as replicated arrays: the form in which they save it together."""
     if jax.process_count() == 1:
         return state
     return place(state, replicated(data_mesh(jax.process_count())))
 
 
 def fill_up(n: int, mesh: Mesh) -> np.ndarray:
-    """Indices of n things, the last one repeated until the devices share them evenly."""
+    """Indices 0 ... n-1. The last one is repeated until the devices can share them evenly."""
     return np.minimum(np.arange(-(-n // mesh.size) * mesh.size), n - 1)
 
 
 def own(tree: Tree, mesh: Mesh, axis: int = 0) -> Tree:
-    """Of arrays that are sharded along an axis the part on this process's devices, as NumPy."""
+    """The part of sharded arrays that is on this process's devices, as NumPy."""
     if jax.process_count() > 1:
-        tree = jax.jit(lambda tree: tree, out_shardings=sharded(mesh, axis))(tree)  # if it is not already
+        tree = jax.jit(lambda tree: tree, out_shardings=sharded(mesh, axis))(tree)  # reshards if needed
         tree = multihost_utils.global_array_to_host_local_array(tree, mesh, sharded(mesh, axis).spec)
     return jax.tree.map(np.asarray, tree)
 
 
 def own_rows(rows: np.ndarray) -> np.ndarray:
-    """This process's part of rows that every process has whole and that they share evenly."""
+    """This process's share of rows. Every process has all of them, and the shares are equal."""
     return np.split(rows, jax.process_count())[jax.process_index()]
 
 
-# ------------------------------------------------------------------------------------ what processes tell each other
+# ----------------------------------------------------------------------------------------- messages between processes
 
 
 def joined(rows: np.ndarray) -> np.ndarray:
-    """All processes' rows, one process after the other; each may have its own number of them."""
+    """The rows of all processes, one process after the other. Each may have a different number of rows."""
     if jax.process_count() == 1:
         return rows
-    own_bytes = np.frombuffer(np.ascontiguousarray(rows).tobytes(), np.uint8)  # JAX would make 32 bits of 64
+    own_bytes = np.frombuffer(np.ascontiguousarray(rows).tobytes(), np.uint8)  # JAX would convert 64 bits to 32
     counts = multihost_utils.process_allgather(np.asarray(len(own_bytes), np.uint32))
     found = multihost_utils.process_allgather(np.pad(own_bytes, (0, counts.max() - len(own_bytes))))
     every_byte = b"".join(part[:n].tobytes() for part, n in zip(found, counts, strict=True))
@@ -139,15 +140,15 @@ def joined(rows: np.ndarray) -> np.ndarray:
 
 
 def largest(number: int) -> int:
-    """The largest of the numbers that the processes name."""
+    """The maximum of a number over all processes."""
     return int(joined(np.array([number])).max())
 
 
 def first(action: Callable[[], T]) -> T:
-    """What process 0 makes of an action that the others leave to it; JSON.
+    """Run an action in process 0 only, and return its result in every process. The result must be valid JSON.
 
     Raises:
-        UserError: in every process, what the action raised in process 0.
+        UserError: in every process, if the action failed in process 0.
     """
     if jax.process_count() == 1:
         return action()

@@ -1,7 +1,7 @@
-"""Driving the Turtlebot3's simulations: the loop that steps a pool under a driver, and what it records.
+"""Driving the Turtlebot3's simulations: the loop that steps a pool under a driver, and its records.
 
-It is to the pool what ``rollout`` is to the mazes, in NumPy. What a lidar shows cannot be recomputed, so an episode
-keeps its local maps, eight cells to the byte.
+It does for the pool, in NumPy, what ``rollout`` does for the mazes. Lidar scans cannot be recomputed, so an episode
+keeps its local maps, with eight cells in a byte.
 """
 
 import functools
@@ -23,41 +23,41 @@ _NOTHING = np.zeros(0, np.uint8)
 
 @dataclass(frozen=True)
 class Drive:
-    """An episode of T steps: what was before each action, and what came of it."""
+    """An episode of T steps: the state before each action, and the outcome after it."""
 
     position: Float[np.ndarray, "T 2"]  # before the action, in the world [m]
     yaw_rad: Float[np.ndarray, "T"]
     proprio: Float[np.ndarray, "T 2"]  # cos dpsi, sin dpsi
-    goal: Float[np.ndarray, "T 2"]  # vector to the final goal as it was observed [m]
+    goal: Float[np.ndarray, "T 2"]  # observed vector to the final goal [m]
     map_bits: UInt8[np.ndarray, "T 157"]
-    action: Float[np.ndarray, "T 2"]  # as meant, in shares of the top speeds
+    action: Float[np.ndarray, "T 2"]  # as intended, without disturbance; in shares of the top speeds
     target: Float[np.ndarray, "T 2"]  # to be imitated
-    learn: Float[np.ndarray, "T"]  # 1 where the target is to be imitated
+    learn: Float[np.ndarray, "T"]  # 1 if the target is to be imitated
     reward: Float[np.ndarray, "T"]  # after the action
     frontal: Bool[np.ndarray, "T"]
     grazing: Bool[np.ndarray, "T"]
     goal_world: Float[np.ndarray, "2"]  # final goal in the world [m]
-    end_world: Float[np.ndarray, "3"]  # where the robot was in the end: x, y [m], yaw [rad]
+    end_world: Float[np.ndarray, "3"]  # final pose of the robot in the world: x, y [m], yaw [rad]
     success: bool
 
     @property
     def length(self) -> int:
-        """Steps."""
+        """Number of steps."""
         return len(self.reward)
 
     @property
     def collision(self) -> np.ndarray:
-        """Whether anything was touched [T]."""
+        """Whether the robot touched anything [T]."""
         return self.frontal | self.grazing
 
     @property
     def path(self) -> Float[np.ndarray, "T+1 2"]:
-        """Positions in the world [m], the last one too."""
+        """Positions in the world [m], including the final one."""
         return np.concatenate([self.position, self.end_world[None, :2]])
 
 
 def to_trajectories(drives: Sequence[Drive]) -> Trajectories:
-    """Episodes as trajectories that keep their maps and goals as they were observed."""
+    """Episodes as trajectories. They keep the observed maps and goals."""
     longest = max(each.length for each in drives)
     parts = []
     for each in drives:
@@ -76,7 +76,7 @@ class Driver(Protocol):
     """Acts in the N slots of a pool at once, in NumPy, as ``rollout.Policy`` does in compiled programs."""
 
     def act(self, memory: Any, frame: Frame) -> tuple[Action, Any]:
-        """Actions [N, 2] for what is seen now, and the memory after them."""
+        """Actions [N, 2] for this observation, and the next memory."""
         ...
 
 
@@ -91,10 +91,10 @@ class _Moment(NamedTuple):
 def drive(
     pool: Turtlebot3Pool, episodes: Sequence[Episode], driver: Driver, begin: Callable[[Frame], Any]
 ) -> list[Drive]:
-    """Drive episodes, one in each slot, to their ends.
+    """Drive episodes to their ends, one in each slot.
 
     Args:
-        begin: the driver's memory, from the first frame.
+        begin: makes the driver's memory from the first frame.
     """
     frame = pool.reset(episodes, range(len(episodes)))
     memory = begin(frame)
@@ -110,7 +110,7 @@ def drive(
 
 
 def _record(moments: list[_Moment], slot: int, episode: Episode) -> Drive:
-    """What happened in a slot until it was done."""
+    """The record of one slot until its episode ended."""
     mine = [moment for moment in moments if not moment.before.done[slot]]
     end = mine[-1].after
 
@@ -131,37 +131,37 @@ def _record(moments: list[_Moment], slot: int, episode: Episode) -> Drive:
 
 
 class Guide(Protocol):
-    """A planner of the Turtlebot3, asked at every step for the next waypoint."""
+    """A planner of the Turtlebot3. It gives the next waypoint at every step."""
 
     def waypoint(self, memory: Any, frame: Frame) -> tuple[Float[np.ndarray, "N 2"], Any]:
-        """Vectors to targets in the robots' own frames [m], and the guide's memory after them."""
+        """Vectors to targets in the robots' own frames [m], and the guide's next memory."""
         ...
 
 
 class Led(NamedTuple):
-    """Memory of N robots that are led."""
+    """Memory of ``GuidedDriver`` for N robots."""
 
-    plan: Any  # the guide's
+    plan: Any  # the guide's memory
     rngs: tuple[np.random.Generator, ...]  # of the disturbances
     disturbance: Float[np.ndarray, "N 2"]
 
 
 @dataclass(frozen=True)
 class GuidedDriver:
-    """The controller led by a planner (paper, sec. III-A), as ``rollout.Guided`` is."""
+    """The controller guided by a planner (paper, sec. III-A), like ``rollout.Guided``."""
 
     guide: Guide
     controller: DifferentialDrive = DifferentialDrive()
-    noise: float = 0.0  # size of a disturbance of the actions, which is not imitated
-    hold: float = 0.9  # chance that it stays as it is for another step
+    noise: float = 0.0  # standard deviation of a disturbance of the actions; it is not imitated
+    hold: float = 0.9  # chance that the disturbance is kept for another step
 
     def init(self, plan: Any, frame: Frame, episodes: Sequence[Episode]) -> Led:
-        """The memory before the first step; ``plan`` is the guide's."""
+        """The memory before the first step; ``plan`` is the guide's memory."""
         rngs = tuple(np.random.default_rng([episode.seed, 1]) for episode in episodes)
         return Led(plan, rngs, np.zeros((len(frame.done), 2)))
 
     def act(self, memory: Led, frame: Frame) -> tuple[Action, Led]:
-        """Towards each robot's waypoint."""
+        """Actions towards each robot's waypoint, and the next memory."""
         target, plan = self.guide.waypoint(memory.plan, frame)
         meant = self.controller(target)
         disturbance = self._disturb(memory, frame.done) if self.noise else memory.disturbance

@@ -1,4 +1,4 @@
-"""Evaluation of the Turtlebot3 in random rooms that no training ever draws (paper, sec. IV-D)."""
+"""Evaluation of the Turtlebot3 in random rooms that no training ever draws (paper, sec. IV-B)."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
-"""The explorer: the reference a user would otherwise pick, with the transformer's own information.
+"""The explorer: a classical planner that sees the same local maps as the transformer. It is the reference.
 
-It remembers every maze cell of which its local maps showed some point, takes all others for free, and at every step
-heads for the cell in believed sight that makes the shortest believed way to the goal. It knows odometry and the size
-and alignment of the maze's cells, which the transformer must do without.
+It remembers each maze cell that its local maps have shown, and assumes that all other cells are free. At every step it
+heads for a visible cell on the shortest path to the goal in that map. Unlike the transformer, it also knows its
+position and the size and alignment of the maze's cells.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from ct_envs.occupancy import MAP_CELLS
 
 @struct.dataclass
 class Seen:
-    """Which cells of the maze have been seen."""
+    """The cells of the maze that have been seen."""
 
     cells: Bool[Array, "N H W"]
 
@@ -30,21 +30,21 @@ class ExplorerGuide:
     radius_m: float
     map_cell_m: float
     cell_m: float
-    look_m: float = 10.0  # farthest waypoint [m]; the controller was trained on edges of this length
+    look_m: float = 10.0  # largest distance of a waypoint [m]; the controller was trained on edges up to this length
 
     def init(self, maze: Maze) -> Seen:
-        """Nothing seen yet. ``maze`` has a leading axis N, here and below."""
+        """The memory before anything is seen. ``maze`` has a leading axis N, here and below."""
         return Seen(jnp.zeros(maze.walls.shape, bool))
 
     def waypoint(self, seen: Seen, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]):
-        """Targets [N, 2] (m), and what has been seen by now."""
+        """Targets [N, 2] (m), and the cells seen so far."""
         seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
         believed = maze.replace(walls=maze.walls & seen.cells)
         to_go = _distances(believed, goal)
         return jax.vmap(self._choose)(believed, to_go, position, goal), seen
 
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
-        """Cells of which the local map at ``position`` holds at least one point."""
+        """Cells of which the local map at ``position`` shows at least one point."""
         offset = (jnp.arange(MAP_CELLS) - (MAP_CELLS - 1) / 2) * self.map_cell_m
         column, row = jnp.floor((position[:, None] + offset[None]) / maze.cell_m).astype(jnp.int32)
         height, width = maze.shape
@@ -63,14 +63,14 @@ class ExplorerGuide:
         away = jnp.linalg.norm(points - position[None], axis=-1)
         reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
         free = jax.vmap(lambda p: in_sight(believed, position, p, radius=self.radius_m, reach=reach))(points)
-        # Of ways of equal length, the one with the farther waypoint: a robot at a cell's centre must not stay there.
-        # If nothing is in sight, the centre of the robot's own cell will do.
+        # If two paths are equally long, take the farther waypoint: a robot at a cell's centre must not stay there.
+        # If no point is visible, take the centre of the robot's own cell.
         usable = (free & (away <= self.look_m)) | (jnp.arange(len(points)) == 1 + len(offsets) // 2)
         return points[jnp.argmin(jnp.where(usable, 0.999 * away + rest, jnp.inf))]
 
 
 def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
-    """Way [m] from cell centres to goals [N, 2] (m), over 4-connected cells that are not wall (value iteration)."""
+    """Path lengths [m] from cell centres to goals [N, 2] (m), over 4-connected free cells (value iteration)."""
     height, width = maze.shape
     cell = jax.vmap(cell_of)(maze, goal)
     rows, columns = jnp.arange(height)[None, :, None], jnp.arange(width)[None, None]

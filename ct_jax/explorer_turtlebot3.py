@@ -1,7 +1,7 @@
-"""The Turtlebot3's explorer: what a user would otherwise pick, with the transformer's own information and odometry.
+"""The Turtlebot3's explorer: a classical planner that sees the same lidar as the transformer. It is the reference.
 
-It marks on a grid where its beams ended, takes all else for free, and heads along the shortest way on that grid.
-It plans in its own odometry, so it knows the room by what it saw alone.
+It marks the ends of its beams on a grid, assumes that all other cells are free, and follows the shortest path on that
+grid. Its positions come from odometry, so it knows the room only by what it saw.
 """
 
 from dataclasses import dataclass, replace
@@ -16,17 +16,17 @@ from ct_envs.lidar import LIDAR_BEAMS, LIDAR_CELL_M, LIDAR_RANGE_M
 from ct_envs.turtlebot3 import to_heading
 from ct_envs.turtlebot3_pool import Frame
 
-_NEAR = 0.15  # share of a straight way that may be blocked: the robot may stand too near to an obstacle already
-_DEAR = 30.0  # how much longer a way through cells is that are too near to an obstacle: a last resort
-_TIGHT = 3.0  # the same within the margin
+_NEAR = 0.15  # first share of a straight path that is not checked: the robot may already be too close to an obstacle
+_DEAR = 30.0  # cost factor of cells that are too close to an obstacle: a last resort
+_TIGHT = 3.0  # cost factor of cells within the margin
 
 
 @dataclass(frozen=True)
 class Charted:
     """One robot's grid, with its start in the middle."""
 
-    origin: Float[np.ndarray, "2"]  # lower left corner, in the world as the robot believes it [m]
-    goal: Float[np.ndarray, "2"]  # likewise [m]
+    origin: Float[np.ndarray, "2"]  # lower left corner, in the frame of the odometry [m]
+    goal: Float[np.ndarray, "2"]  # in the same frame [m]
     occupied: Bool[np.ndarray, "n n"]  # row y, column x
     age: int = 0  # steps since the plan was made
     target: Float[np.ndarray, "2"] | None = None
@@ -36,15 +36,15 @@ class Charted:
 class ExplorerGuide:
     """Optimistic replanning on the lidar's grid, for the slots of a pool."""
 
-    clear_m: float  # kept between the robot's middle and what it saw
-    margin_m: float = 0.0  # kept beyond that where the way round is not much longer
+    clear_m: float  # smallest distance between the robot's centre and an obstacle
+    margin_m: float = 0.0  # distance kept beyond that, unless the detour is much longer
     cell_m: float = LIDAR_CELL_M
-    side_m: float = 14.0  # of the grid: from a start at one corner of a room it reaches the other
+    side_m: float = 14.0  # side of the grid: from a start in one corner of a room it covers the opposite corner
     every: int = 5  # steps between two plans
-    look_m: float = 0.8  # farthest waypoint: within what the lidar has shown
+    look_m: float = 0.8  # largest distance of a waypoint: inside the lidar's range
 
     def init(self, frame: Frame, *_: object) -> tuple[Charted, ...]:
-        """Nothing seen yet."""
+        """The memory before anything is seen."""
         n = round(self.side_m / self.cell_m)
         goal = _in_world(frame, frame.goal)
         return tuple(
@@ -53,7 +53,7 @@ class ExplorerGuide:
         )
 
     def waypoint(self, memory: tuple[Charted, ...], frame: Frame) -> tuple[np.ndarray, tuple[Charted, ...]]:
-        """Vectors to targets [N, 2] (m), and what has been seen by now."""
+        """Vectors to targets [N, 2] (m), and the grids so far."""
         here, met = frame.believed_position, frame.ranges < LIDAR_RANGE_M
         ends = _beam_ends(frame)
         charts = [
@@ -64,7 +64,7 @@ class ExplorerGuide:
         return to_heading(np.stack(target) - here, frame.believed_yaw_rad), tuple(charts)
 
     def _look(self, chart: Charted, hits: np.ndarray, position: np.ndarray) -> Charted:
-        """What the beams met is marked, and now and then a new plan made."""
+        """Mark the obstacles that beams hit, and plan again every ``every`` steps."""
         at = self._cell(chart, hits)
         at = at[((at >= 0) & (at < len(chart.occupied))).all(-1)]
         occupied = chart.occupied.copy()
@@ -75,7 +75,7 @@ class ExplorerGuide:
         return replace(chart, target=self._plan(chart, position))
 
     def _plan(self, chart: Charted, position: np.ndarray) -> np.ndarray:
-        """The farthest point of the shortest way that can be reached straight on."""
+        """The farthest point of the shortest path that the robot can reach in a straight line."""
         n, reach = len(chart.occupied), round(1.5 / self.cell_m)
         ends = np.clip(np.stack([self._cell(chart, position), self._cell(chart, chart.goal)]), 0, n - 1)
         low, high = np.maximum(ends.min(0) - reach, 0), np.minimum(ends.max(0) + reach + 1, n)
@@ -92,7 +92,7 @@ class ExplorerGuide:
         share = np.linspace(0.0, 1.0, 25)[:, None, None]
         column, row = np.moveaxis(self._cell(chart, position + share * (close - position)) - low, -1, 0)
         inside = np.clip(row, 0, len(cost) - 1), np.clip(column, 0, cost.shape[1] - 1)
-        # A straight way may be as tight as the one it cuts short, and no tighter.
+        # The straight line may be as close to obstacles as the path that it replaces, but not closer.
         straight = np.where(share[..., 0] > _NEAR, cost[inside], 1.0).max(0)
         tight = np.maximum.accumulate(cost[way[1:, 1], way[1:, 0]])[: len(close)]
         free = np.flatnonzero(straight <= tight)
@@ -111,7 +111,7 @@ def _distance(occupied: np.ndarray, cell_m: float) -> np.ndarray:
 
 
 def _way(cost: np.ndarray, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Cells [k, 2] (column, row) of a shortest way."""
+    """Cells [k, 2] (column, row) of a shortest path."""
     first, last = (int(row * cost.shape[1] + column) for column, row in (start, goal))
     _, before = dijkstra(_grid(cost), indices=last, return_predecessors=True)
     way = [first]
@@ -121,7 +121,7 @@ def _way(cost: np.ndarray, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def _grid(cost: np.ndarray) -> csr_array:
-    """The 8-connected graph of a grid, by what a way through each cell costs (1 where it is free)."""
+    """The 8-connected graph of a grid of costs: the cost of a cell (1 if free) multiplies the path length in it."""
     index = np.arange(cost.size).reshape(cost.shape)
     rows, columns, weights = [], [], []
     for here, there, length in (
@@ -138,12 +138,12 @@ def _grid(cost: np.ndarray) -> csr_array:
 
 
 def _beam_ends(frame: Frame) -> Float[np.ndarray, "N 360 2"]:
-    """Where beams end in the world as the robot believes it [m]; of those that met nothing, somewhere."""
+    """The ends of the beams in the frame of the odometry [m]. The ends of beams that hit nothing are not valid."""
     angle = frame.believed_yaw_rad[:, None] + np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS)
     ranges = np.minimum(frame.ranges, LIDAR_RANGE_M)[..., None]
     return frame.believed_position[:, None] + ranges * np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
 def _in_world(frame: Frame, vector: np.ndarray) -> np.ndarray:
-    """Points [N, 2] of that world (m) from vectors in the robots' own frames."""
+    """Points [N, 2] in the frame of the odometry (m), from vectors in the robots' own frames."""
     return frame.believed_position + to_heading(vector, -frame.believed_yaw_rad)

@@ -1,4 +1,4 @@
-"""Planning-guided fine-tuning: the policy's failures, and the planner's way out of them (paper, Algorithm 4)."""
+"""Planning-guided fine-tuning: the policy's failures, and the planner's recoveries from them (paper, Algorithm 4)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,31 +24,31 @@ from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, con
 
 
 class NoRecoveryError(UserError):
-    """There is nothing to fine-tune on: the planner saves none of a policy's episodes, or hardly one wants it."""
+    """There is nothing to fine-tune on: the planner recovers no episode, or the policy hardly ever fails."""
 
 
 @dataclass(frozen=True)
 class RecoverConfig(Checked):
-    """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's where it gives any."""
+    """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's, if the paper gives them."""
 
     recoveries: Count = 500  # T
-    stuck_steps: Annotated[int, Within(1, 100_000)] = 40  # failure: in so many steps ...
+    stuck_steps: Annotated[int, Within(1, 100_000)] = 40  # failure: within this many steps ...
     stuck_m: Annotated[float, Within(0, 10_000)] = 4.0  # ... the robot moved less than this [m]
-    bumps: Annotated[int, Within(1, 100_000)] | None = None  # failure: the robot touched a wall in so many of the last
-    # ``stuck_steps``
-    patience: Annotated[int, Within(1, 1_000_000)] = 200  # failure: not at the goal after so many steps
-    takeover: Share = 0.0  # chance at each step that the planner takes over though nothing failed; paper: 0
+    bumps: Annotated[int, Within(1, 100_000)] | None = None  # failure: the robot touched a wall in this many of the
+    # last ``stuck_steps``
+    patience: Annotated[int, Within(1, 1_000_000)] = 200  # failure: the goal is not reached after this many steps
+    takeover: Share = 0.0  # chance at each step that the planner takes over without a failure; paper: 0
     keep: Literal["separate", "joined", "relabelled"] = "separate"  # failure and recovery as two trajectories (paper);
-    # "joined": one, the failure only seen;
-    # "relabelled": one, and at every step of it the planner's action is what is imitated (DAgger)
-    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # so many mazes of a generator to fail and recover in, besides
-    # the run's
+    # "joined": one trajectory, in which only the recovery is imitated;
+    # "relabelled": one trajectory, and the planner's action is imitated at every step (DAgger)
+    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # number of random mazes to fail and recover in, besides the
+    # run's mazes
     give_up: Annotated[float, Above(0, 1_000_000)] = 20.0  # stop after this many times T episodes
 
 
 @struct.dataclass
 class Watching:
-    """Memory of a policy under supervision."""
+    """Memory of ``Supervised``."""
 
     own: Any
     guided: Any
@@ -60,7 +60,7 @@ class Watching:
 
 @struct.dataclass
 class Supervised:
-    """The transformer until f(s) says that it failed; from then on the controller led by the planner."""
+    """The transformer until f(s) detects a failure; from then on the controller guided by the planner."""
 
     own: TransformerPolicy
     guided: Guided
@@ -89,7 +89,7 @@ class Supervised:
         return action, Watching(own_memory, guided_memory, past, touched, memory.steps + 1, rescued)
 
     def _failed(self, memory: Watching, position: jax.Array) -> Bool[Array, "N"]:
-        """f(s): stuck in a place, against walls time and again, or out of patience. (A fall ends the episode.)"""
+        """f(s): the robot is stuck, touches walls repeatedly, or takes too long. (A fall ends the episode.)"""
         stuck = jnp.linalg.norm(position - memory.past[0], axis=-1) < self.config.stuck_m
         if self.config.bumps is not None:
             stuck |= memory.touched.sum(0) >= self.config.bumps
@@ -112,21 +112,20 @@ def recover(
     """Algorithm 4: failures of the policy and the planner's recoveries from them.
 
     Args:
-        env: with maps, without auto-reset; its horizon bounds failure and recovery together.
-        collecting: whose starts, guide, reset interval and number of environments are used.
+        env: with maps, without auto-reset; its horizon limits failure and recovery together.
+        collecting: gives starts, guide, noise, reset interval and number of environments.
 
     Returns:
         With ``keep="separate"`` two trajectories for each recovery, otherwise one.
 
     Raises:
         NoRecoveryError: no recovery within ``give_up * T`` episodes.
-        UserError: a ``keep`` that means nothing.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     maze_key, wave_key = jax.random.split(key)
     first_maze = int(
         jax.random.randint(maze_key, (), 0, len(mazes.cell_m))
-    )  # where there are many, each round in others
+    )  # so that each round uses other mazes if there are many
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
@@ -149,15 +148,15 @@ def gather_recoveries(
     wave: Callable[[int], tuple[Trajectories, np.ndarray, np.ndarray]],
     on_progress: Callable[[int, int], None],
 ) -> Trajectories:
-    """The loop of Algorithm 4: supervised episodes, wave after wave, until T were recovered, or ``give_up * T`` began.
+    """The loop of Algorithm 4: supervised episodes, wave after wave, until T recoveries or ``give_up * T`` episodes.
 
     Args:
-        envs: episodes of a wave, of at most ``horizon`` steps.
-        wave: given the number of its first episode, this process's share of its episodes, which of them succeeded, and
-            which broke off, by a fall or a fault.
+        envs: episodes in a wave, each of at most ``horizon`` steps.
+        wave: a function of the index of its first episode. It returns this process's share of the episodes, which of
+            them succeeded, and which broke off (see ``rollout.broke_off``).
 
     Raises:
-        UserError: as ``recover``, NoRecoveryError included.
+        NoRecoveryError: as ``recover``.
     """
     kept: list[Trajectories] = []
     recoveries = episodes = broken = 0
@@ -165,7 +164,7 @@ def gather_recoveries(
         if episodes >= config.give_up * config.recoveries:
             break
         data, rescued, broke = wave(episodes)
-        if config.keep == "relabelled":  # the transformer's own successes are told what is better, too, and its falls
+        if config.keep == "relabelled":  # also keep the transformer's own successes and falls: they are relabelled too
             data, rescued = lie_for_ever(data, broke, horizon), rescued | broke
         else:
             rescued = rescued & (data.learn.sum(1) > 0)
@@ -174,14 +173,14 @@ def gather_recoveries(
         broken += int(joined(broke).sum())
         on_progress(recoveries, episodes)
     if not recoveries:
-        why = "it falls before it is helped" if 2 * broken > episodes else "the policy hardly fails"
+        why = "the robot falls before the planner takes over" if 2 * broken > episodes else "the policy hardly fails"
         raise NoRecoveryError(f"no recovery in {episodes} episodes, {broken} falls: {why}, so skip fine-tuning")
     return concatenate(kept)
 
 
 def lie_for_ever(data: Trajectories, broke: Bool[Array, "N"], horizon: int) -> Trajectories:
-    """The trajectories, with those that broke off paid as if the robot lay there until the horizon: a short one is not
-    a good one."""
+    """Charge an episode that broke off as if the robot lay there until the horizon: a short trajectory must not look
+    like a good one."""
     row, last = np.flatnonzero(broke), np.asarray(data.length)[broke] - 1
     reward = np.array(data.reward)
     reward[row, last] *= horizon - last
@@ -189,7 +188,7 @@ def lie_for_ever(data: Trajectories, broke: Bool[Array, "N"], horizon: int) -> T
 
 
 def _split(data: Trajectories) -> list[Trajectories]:
-    """Each trajectory as two: up to the failure, and the recovery from it."""
+    """Split each trajectory in two: up to the failure, and the recovery from it."""
     learn = np.asarray(data.learn)
     begin = learn.argmax(1)
     fail = data.replace(length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None]))

@@ -26,24 +26,24 @@ from ct_jax.trajectories import Trajectories
 
 @struct.dataclass
 class Given:
-    """The policy of which somebody else has already said what it does: its memory is its action."""
+    """A policy whose action is already computed: its memory is its action."""
 
     def act(self, memory: Action, state: State, key: jax.Array) -> tuple[Action, Action]:
-        """What was said."""
+        """The action in memory."""
         del state, key
         return memory, memory
 
 
 @dataclass(frozen=True)
 class SupervisedDriver:
-    """The transformer until it failed, then the planner: ``Supervised`` in the slots of a pool."""
+    """The transformer until it fails, then the planner: ``Supervised`` in the slots of a pool."""
 
     supervised: Supervised  # with ``Given`` for the planner
     planner: GuidedDriver
     key: jax.Array
 
     def act(self, memory: tuple[Any, Any, int], frame: Frame) -> tuple[Action, tuple[Any, Any, int]]:
-        """The action of whoever drives; the memory is what ``Supervised`` remembers, the planner's, and the steps."""
+        """The action of the transformer or the planner. Memory: that of ``Supervised``, the planner's, and the step."""
         watching, led, step = memory
         guided, led = self.planner.act(led, frame)
         key = jax.random.fold_in(self.key, step)
@@ -68,9 +68,9 @@ def recover(
     """Algorithm 4: failures of the policy and the planner's recoveries from them; see ``finetune.recover``.
 
     Args:
-        pool: its horizon bounds failure and recovery together.
-        collecting: whose starts, guide, reset interval and number of episodes at a time are used.
-        densities: of obstacles, as for ``make_room``.
+        pool: its horizon limits failure and recovery together.
+        collecting: gives starts, guide, noise, reset interval and number of episodes at a time.
+        densities: of obstacles, see ``make_room``.
         keep: see ``collect_turtlebot3.keeping``.
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, prm)

@@ -1,8 +1,8 @@
-"""Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-C).
+"""Supervised training of the value network and the transformer on trajectories (paper, Algorithm 1 and sec. III-D).
 
-The data lie in memory as arrays; a compiled step draws its own windows from them, recomputes their maps and updates the
-parameters, so the host does nothing but watch. Trajectories and batches are sharded over the devices of ``data_mesh``:
-all draw the same windows, each hands over the steps of them that it holds, and each takes its share of the batch.
+The data are arrays in device memory. A compiled step draws windows from them, recomputes their maps and updates the
+parameters; the host only reports progress. Trajectories and batches are sharded over the devices of ``data_mesh``: all
+devices draw the same windows, each sends the steps that it holds, and each computes its share of the batch.
 """
 
 import math
@@ -28,46 +28,46 @@ from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windo
 from ct_jax.transformer import RETURN_SCALE, ControlTransformer, Modes, sample_inputs
 from ct_jax.value import ValueNetwork
 
-# Squared error between actions of one mode: more than a single one leaves (point 0.03, ant 0.014), lest modes become
-# moments of a gait, and less than between actions of two ways.
+# Expected squared error within one mode. It is larger than the error of a single-mode model (point 0.03, ant 0.014):
+# otherwise modes become phases of a gait. It is smaller than the squared difference between two routes' actions.
 MODE_SPREAD = 0.05
 
 
 @dataclass(frozen=True)
 class FitConfig(Checked):
-    """One supervised training (paper, table II)."""
+    """One supervised training (paper, table I)."""
 
     updates: Count = 75_000
-    batch: Annotated[int, Within(1, 1_000_000)] = 64  # pieces of trajectories
-    steps: Annotated[int, Within(1, 100_000)] = 50  # steps of a piece, ``ModelConfig.stride`` apart; with more than K,
-    # pieces share their past
+    batch: Annotated[int, Within(1, 1_000_000)] = 64  # windows in a batch
+    steps: Annotated[int, Within(1, 100_000)] = 50  # steps in a window, ``ModelConfig.stride`` apart; with more than K,
+    # a window trains several predictions with a full past
     learning_rate: Annotated[float, Above(0, 10)] = 4e-4
     weight_decay: Annotated[float, Within(0, 100)] = 1e-3
     warmup: Count = 10_000  # updates of linear warm-up
     decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
-    clip: Annotated[float, Above(0, 1_000_000)] = 1.0  # norm to which gradients are clipped
-    mirror: bool = False  # turn and reflect pieces by a random symmetry of the robot
-    turns: bool = False  # with ``mirror``: only turn the world with the robot in it. A controller that is not symmetric
-    # itself has one gait; its mirror image is another, and what learns both learns their mean
-    shift_timestep: Annotated[int, Within(0, 1_000_000)] = 0  # add a random number up to this to a piece's timesteps
-    precision: Literal["float32", "bfloat16"] = "float32"  # of the transformer's computations; "bfloat16" on
-    # accelerators, parameters stay float32
+    clip: Annotated[float, Above(0, 1_000_000)] = 1.0  # largest norm of a gradient
+    mirror: bool = False  # turn and reflect each window by a random symmetry of the robot
+    turns: bool = False  # with ``mirror``: only rotate the world with the robot in it. The gait of a controller may not
+    # be symmetric; then a model that also learns the mirrored gait learns the mean of the two
+    shift_timestep: Annotated[int, Within(0, 1_000_000)] = 0  # add a random number up to this to a window's timesteps
+    precision: Literal["float32", "bfloat16"] = "float32"  # of the transformer's computations: "bfloat16" for
+    # accelerators; parameters stay float32
 
 
 @dataclass(frozen=True)
 class ValueConfig(Checked):
-    """The value network's training, and which trajectories it sees (paper, sec. III-C)."""
+    """Training of the value network, and the selection of its trajectories (paper, sec. III-D)."""
 
     fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
-    top: Annotated[float, Above(0, 1)] = 1.0  # only the best share X of the trajectories, by return over the straight
-    # distance squared
+    top: Annotated[float, Above(0, 1)] = 1.0  # use only this best share X of the trajectories, ranked by return divided
+    # by the squared straight distance
     collision_free: bool = False  # only trajectories without a collision
     width: Annotated[int, Within(1, 16_384)] = 128
 
 
 @struct.dataclass
 class FitState:
-    """Everything that training needs to go on."""
+    """The complete state of training, from which it can continue."""
 
     params: Any
     optimizer: Any
@@ -84,7 +84,7 @@ class Fit:
     def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float, robot: Robot, *, stride: int = 1):
         """
         Args:
-            stride: from one step of a piece to the next.
+            stride: control steps from one step of a window to the next.
         """
         self.loss, self.config, self.map_cell_m, self.stride = loss, config, map_cell_m, stride
         self._symmetries = symmetries(robot) if config.mirror else None
@@ -111,7 +111,7 @@ class Fit:
     def _train(
         self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze | None, updates: int
     ) -> tuple[FitState, jax.Array]:
-        """Run some updates (static); returns the mean loss over them."""
+        """Run ``updates`` updates (static); returns the state and the mean loss."""
 
         def update(state: FitState, _) -> tuple[FitState, jax.Array]:
             draw, drop = jax.random.split(jax.random.fold_in(state.key, state.update))
@@ -138,16 +138,16 @@ class Fit:
 
 
 def _matrices(params: Any) -> Any:
-    """Weight decay is for matrices and kernels, not for biases and norms, nor for a skill that stays as it is."""
+    """Which leaves have weight decay: matrices and kernels; not biases and norms, and not the fixed skill."""
     decays = jax.tree.map(lambda leaf: leaf.ndim > 1, params)
     return decays | {"skill": jax.tree.map(lambda leaf: False, params["skill"])} if "skill" in params else decays
 
 
 def transformer_loss(model: ControlTransformer) -> Loss:
-    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-C).
+    """Mean squared error of the predicted actions over the steps to imitate (paper, sec. III-D).
 
-    Of several modes, minus the logarithm of the likelihood of a mixture of Gaussians around them, scaled such that of a
-    single one the squared error is left.
+    With several modes it is the negative log-likelihood of a mixture of Gaussians around them. The scale is such that
+    with one mode it equals the squared error.
     """
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
@@ -164,7 +164,7 @@ def transformer_loss(model: ControlTransformer) -> Loss:
 
 
 def value_loss(model: ValueNetwork) -> Loss:
-    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-C)."""
+    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-D)."""
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
         del key
@@ -179,7 +179,7 @@ def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: 
     """Fresh parameters for data of these sizes.
 
     Args:
-        given: parameters of which what is not learned, a skill, stays.
+        given: parameters whose fixed part, a skill, is kept.
     """
     inputs = sample_inputs(data.proprio.shape[-1], data.action.shape[-1])
     fresh = jax.jit(model.init)(key, *(inputs[:3] if isinstance(model, ValueNetwork) else inputs))
@@ -187,21 +187,21 @@ def init_params(key: jax.Array, model: ControlTransformer | ValueNetwork, data: 
 
 
 def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m: float) -> Trajectories:
-    """The trajectories that the value network learns from: those that arrive (a failure's return says nothing of the
-    way), of them the top X %, and collision-free on demand.
+    """The trajectories for the value network: those that arrive at the goal and, depending on ``config``, the top X %
+    and those without collision. The return of a failure says nothing about the path length, so failures are left out.
 
     Raises:
-        UserError: none is left.
+        UserError: no trajectory is left.
     """
     last = np.maximum(np.asarray(data.length) - 1, 0)
     keep = np.asarray(at_goal(np.asarray(data.reward)[np.arange(data.n), last], goal_tolerance_m))
     if not joined(keep).any():
-        raise UserError("no trajectory arrives at its goal; collect anew")
+        raise UserError("no trajectory arrives at its goal; collect again")
     if config.collision_free:
         inside = np.arange(data.collision.shape[1]) < np.asarray(data.length)[:, None]
         keep &= ~((np.asarray(data.collision) > 0) & inside).any(1)
         if not joined(keep).any():
-            raise UserError("every trajectory has a collision: give the roadmap a margin, or allow collisions")
+            raise UserError("every trajectory has a collision; raise prm.margin_m or set value.collision_free=False")
     if config.top < 1.0:
         straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
         score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
@@ -210,12 +210,11 @@ def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m:
 
 
 def spread(data: Trajectories, mesh: Mesh) -> tuple[Trajectories, Float[Array, "N T"]]:
-    """The trajectories of all processes as one set over their devices, and their returns-to-go.
+    """The trajectories of all processes as one data set, sharded over their devices, and their returns-to-go.
 
-    The lengths, from which windows are drawn, are on every device: they are small, and so nothing but the steps that
-    were drawn ever travels.
+    The lengths are replicated: windows are drawn from them, so devices exchange only the steps that were drawn.
     """
-    # A dataset that grows from round to round compiles anew only when it outgrows these.
+    # Sizes are rounded up, so a data set that grows from round to round seldom needs a new compilation.
     rows = math.lcm(1024, len(mesh.local_devices))
     data = pad(data, -(-largest(data.n) // rows) * rows, -(-largest(data.position.shape[1]) // 256) * 256)
     data = feed(data, mesh)
@@ -236,13 +235,13 @@ def fit(
     chunk: int = 20,
     updates: int | None = None,
 ) -> Any:
-    """Train to the configured number of updates; returns the parameters, on the host.
+    """Train for the configured number of updates; returns the parameters, on the host.
 
     Args:
-        data: this process's own trajectories; those of all processes are one set.
-        updates: stop already after so many; ``checkpoints`` allow to go on from there.
-        on_progress: told (updates done, mean loss since the last call) after every ``chunk``.
-        checkpoints: where to go on from, and where to save now and then and when interrupted.
+        data: this process's own trajectories; the trajectories of all processes form one data set.
+        updates: stop earlier, after this many updates; with ``checkpoints`` training can continue from there.
+        on_progress: called with (updates done, mean loss since the last call) after every ``chunk``.
+        checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
     state = learner.create(key, params)
     data, rtg = spread(data, learner.mesh)

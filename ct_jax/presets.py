@@ -37,7 +37,7 @@ class Settings(Checked):
     rounds: Annotated[int, Within(0, 1000)] = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
     round_fit: FitConfig | None = None  # the training in each round but the last; by default as ``fit``
     last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
-    optimism: Annotated[float, Above(0, MAX_OPTIMISM)] = 1.0  # k: ask for k * V (paper, sec. III-C)
+    optimism: Annotated[float, Above(0, MAX_OPTIMISM)] = 1.0  # k: ask for k * V (paper, sec. III-D)
     reprompt: bool = False  # never ask for more than V of the present state
     random_mazes: Annotated[int, Within(0, 10_000)] = 0  # so many mazes of a generator to collect and recover in,
     # besides the named ones
@@ -53,7 +53,7 @@ PAPER = Settings(
         updates=75_000, batch=64, steps=50, learning_rate=4e-4, weight_decay=1e-3, warmup=10_000, precision="bfloat16"
     ),
 )
-"""The method as published, table II; wants a GPU."""
+"""The method as published, table I; wants a GPU."""
 
 PUBLISHED = replace(
     PAPER,
@@ -211,7 +211,7 @@ TURTLEBOT3_PAPER = Settings(
     episodes=25,
     rooms=RoomConfig(),
 )
-"""The Turtlebot3 as published, table II: F-CT."""
+"""The Turtlebot3 as published, table I: F-CT."""
 
 _TURTLEBOT3_LIFTED = replace(
     TURTLEBOT3_PAPER.fit, batch=20, steps=40, learning_rate=1e-3, warmup=100, mirror=True, decay=True

@@ -1,8 +1,8 @@
 """Probabilistic roadmaps: the planner that knows the maze (paper, sec. III-A).
 
-A ``Roadmap`` is a ``networkx`` graph with its points as an array and, for use under jit, an all-pairs table of next
-hops, so that "where do I go next" is a lookup with thousands of environments on different mazes at once. It is built
-over a ``Maze``, or any other ``Space``.
+A ``Roadmap`` is a graph over sampled points. For use under jit it gives an all-pairs table of next hops: the next
+waypoint of a plan is one lookup, for thousands of environments in different mazes at once. It is built over a ``Maze``
+or any other ``Space``.
 """
 
 import functools
@@ -24,30 +24,29 @@ from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, clearance, in_sight, label_regions, segment_free, segment_reach, unpadded
 
-_CANDIDATES = 64  # nearest points among which a new waypoint is sought
-_ALL_PAIRS = 2048  # a larger roadmap has a table of the ways to its goals only: all pairs would fill the memory
-_JOINED_SHARE = 0.5  # a roadmap suffices by itself if it joins so many of the pairs of its own points
-_NOWHERE_M = 1e7  # coordinate of points that only fill up a table: in sight of nothing
+_CANDIDATES = 64  # number of nearest points from which a new waypoint is chosen
+_ALL_PAIRS = 2048  # points; the table of a larger roadmap holds the paths to its goals only, to save memory
+_JOINED_SHARE = 0.5  # without given ends, a roadmap is complete if it joins this share of the pairs of its own points
+_NOWHERE_M = 1e7  # coordinate of padding points: nothing can see them
 NO_HOP = -1  # entry of the next-hop table where there is no path
 
 
 @dataclass(frozen=True)
 class PrmConfig(Checked):
-    """How roadmaps are sampled (paper, sec. III-F)."""
+    """How roadmaps are sampled (paper, sec. III-G)."""
 
-    samples: Annotated[int, Within(2, 20_000)] = 200  # n; as many again follow until the roadmap joins starts and goals
+    samples: Annotated[int, Within(2, 20_000)] = 200  # n; doubled until the roadmap joins starts and goals
     connect_m: Annotated[float, Above(0, 10_000)] = 10.0  # d: longest edge [m]
-    margin_m: Annotated[float, Within(0, 100)] = 0.0  # clearance kept beyond the robot's radius [m]; the paper keeps
-    # none
-    most_samples: Annotated[int, Within(2, 30_000)] = 25_600  # a roadmap that does not join everything by then stays as
-    # it is; a point's number is kept in 16 bits
+    margin_m: Annotated[float, Within(0, 100)] = 0.0  # clearance beyond the robot's radius [m]; the paper has none
+    most_samples: Annotated[int, Within(2, 30_000)] = 25_600  # sampling stops at this number, even if the roadmap does
+    # not join everything; a point's index has 16 bits
 
 
 @struct.dataclass
 class PlanTable:
     """A roadmap as arrays, for use under jit. May have leading batch axes.
 
-    Column j holds the ways to ``points[goal[j]]``: to every point of a small roadmap, to some of a large one.
+    Column j holds the paths to ``points[goal[j]]``. A small roadmap has a column for every point, a large one for some.
     """
 
     points: Float[Array, "*b n 2"]  # [m]
@@ -78,18 +77,18 @@ class NoPath:
 
 
 class Space(Protocol):
-    """What a roadmap asks of a world, in NumPy: ``ct_envs.turtlebot3_world.World``, or a maze as ``MazeSpace``."""
+    """What a roadmap needs to know of a world, in NumPy: ``MazeSpace`` or ``ct_envs.turtlebot3_world.World``."""
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Distance [k] (m) from points [k, 2] (m) to the nearest obstacle."""
         ...
 
     def segment_free(self, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Whether discs of ``radius`` [k] (m) swept along segments, by their ``ends`` [k, 2, 2] (m), touch nothing."""
+        """Whether discs of ``radius`` [k] (m), swept along segments with ``ends`` [k, 2, 2] (m), touch nothing."""
         ...
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
-        """n points [n, 2] (m), uniform over the area with clearance ``radius`` [m]."""
+        """n points [n, 2] (m), uniform over the area that has clearance ``radius`` [m]."""
         ...
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
@@ -104,9 +103,9 @@ class Roadmap:
     points: np.ndarray  # float32 [n, 2], [m]
     edges: np.ndarray  # int32 [m, 2], each once, first < second
     maze: Maze | Space
-    radius_m: float  # of the robot; every edge keeps it clear, and edges between samples the margin too
+    radius_m: float  # of the robot; every edge has this clearance, edges between samples also have the margin
     config: PrmConfig
-    samples: int  # the first so many points are samples; points that were given follow
+    samples: int  # number of sampled points; they come first, points added later follow
 
     @property
     def length(self) -> np.ndarray:
@@ -115,7 +114,7 @@ class Roadmap:
 
     @functools.cached_property
     def graph(self) -> nx.Graph:
-        """The roadmap for networkx; edges carry their length as ``weight`` [m]."""
+        """The roadmap as a networkx graph. Each edge has its length as ``weight`` [m]."""
         graph = nx.Graph()
         graph.add_nodes_from(range(len(self.points)))
         graph.add_weighted_edges_from(zip(*self.edges.T.tolist(), self.length.tolist(), strict=True))
@@ -123,7 +122,7 @@ class Roadmap:
 
     @functools.cached_property
     def _weights(self) -> csr_array:
-        """Lengths of the edges, each in both directions: for csgraph, a directed graph (half the work of its other)."""
+        """Lengths of the edges, each in both directions: csgraph does half the work on a directed graph."""
         both = np.concatenate([self.edges, self.edges[:, ::-1]])
         return csr_array((np.tile(self.length, 2), (both[:, 0], both[:, 1])), shape=(len(self.points),) * 2)
 
@@ -138,12 +137,12 @@ class Roadmap:
         return self._table(np.arange(len(self.points)))
 
     def table_to(self, goals: Int[np.ndarray, "k"]) -> PlanTable:
-        """Next hops and distances to some of the points; to all of them where the roadmap is small."""
+        """Next hops and distances to the points ``goals``; to all points if the roadmap is small."""
         return self.table if len(self.points) <= _ALL_PAIRS else self._table(np.unique(goals))
 
     def _table(self, goals: Int[np.ndarray, "m"]) -> PlanTable:
         distance, predecessor = dijkstra(self._weights, indices=goals, return_predecessors=True)
-        # The point before i on a path from j is, the graph being undirected, the one after i on the way to j.
+        # The graph is undirected: the point before i on the path from j is also the point after i on the path to j.
         next_hop = np.where(predecessor.T < 0, NO_HOP, predecessor.T).astype(np.int16)
         next_hop[goals, np.arange(len(goals))] = goals
         all_pairs = len(goals) == len(self.points)
@@ -159,7 +158,7 @@ class Roadmap:
         return dijkstra(self._weights, indices=pairs[:, 0])[np.arange(len(pairs)), pairs[:, 1]].astype(np.float32)
 
     def plan(self, start: np.ndarray, goal: np.ndarray) -> Path | NoPath:
-        """Shortest path between any two points [m], which are connected to the roadmap as nodes of their own."""
+        """Shortest path between any two points [m]. Both are connected to the roadmap as new nodes."""
         ends = np.asarray([start, goal], np.float32)
         for name, room in zip(("start", "goal"), as_space(self.maze).clearance(ends), strict=True):
             if not room >= self.radius_m:
@@ -184,15 +183,15 @@ def build_roadmap(
     config: PrmConfig | None = None,
     ends: Float[np.ndarray, "k 2 2"] | None = None,
 ) -> Roadmap:
-    """Sample a roadmap: points uniform over the collision-free area, edges wherever the swept robot stays free.
+    """Sample a roadmap: points uniform over the collision-free area, edges where the swept robot touches nothing.
 
-    The first ``config.samples`` are the paper's. A large maze needs more: their number is doubled until the roadmap
-    joins each start to its goal or, without ``ends``, most of its own points to each other.
+    The paper samples ``config.samples`` points. A large maze needs more: their number is doubled until the roadmap
+    joins each start to its goal. Without ``ends``, it is doubled until the roadmap joins most of its own points.
 
     Args:
         key: the only source of randomness.
-        radius_m: of the robot [m]; ``config.margin_m`` is added to it.
-        ends: starts and goals [m], which are not points of the roadmap.
+        radius_m: radius of the robot [m]; ``config.margin_m`` is added.
+        ends: starts and goals [m]. They do not become points of the roadmap.
 
     Raises:
         UserError: the maze or world is too narrow for the robot.
@@ -212,7 +211,10 @@ def build_roadmap(
 
 
 def _suffices(roadmap: Roadmap, ends: np.ndarray | None) -> bool:
-    """Whether a roadmap joins what lies in one free region: each start to its goal, or most of its own points."""
+    """Whether a roadmap joins each start to its goal or, without ``ends``, most of its own points.
+
+    Pairs in different free regions do not count.
+    """
     space = as_space(roadmap.maze)
     if ends is None:
         region, component = space.regions(roadmap.points, roadmap.radius_m), roadmap.components
@@ -230,17 +232,17 @@ def joins(roadmap: Roadmap, ends: Float[np.ndarray, "k 2 2"]) -> Bool[np.ndarray
 
 
 def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 2"]:
-    """n pairs of different points that the roadmap joins, each such pair equally likely.
+    """n pairs of different points that the roadmap joins; all such pairs are equally likely.
 
     Raises:
-        UserError: it joins no two of its points.
+        UserError: the roadmap joins no two of its points.
     """
     component = roadmap.components
-    others = np.bincount(component)[component] - 1  # how many pairs begin at each point
+    others = np.bincount(component)[component] - 1  # number of pairs that begin at each point
     ends = np.cumsum(others)
     if not ends[-1]:
-        raise UserError("the roadmap joins no two of its points; sample more of them or connect farther ones")
-    number = np.asarray(jax.random.randint(key, (n,), 0, int(ends[-1])))  # of the pair, in the order of its points
+        raise UserError("the roadmap joins no two of its points; raise prm.samples or prm.connect_m")
+    number = np.asarray(jax.random.randint(key, (n,), 0, int(ends[-1])))  # index of the pair, ordered by first point
     first = np.searchsorted(ends, number, side="right")
     order = np.argsort(component, kind="stable")  # the members of each component, in order
     place = np.empty_like(order)
@@ -252,7 +254,7 @@ def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:
-    """The roadmap with further points [k, 2] (m), appended in order and connected wherever the bare robot fits."""
+    """The roadmap with more points [k, 2] (m), appended in order. Edges to them keep the radius, not the margin."""
     return _connect(roadmap, points, sampled=False)
 
 
@@ -261,7 +263,7 @@ def _connect(roadmap: Roadmap, points: np.ndarray, *, sampled: bool) -> Roadmap:
     points = np.concatenate([roadmap.points, np.asarray(points, np.float32)])
     pairs = _new_pairs(points, known, roadmap.config.connect_m)
     samples = len(points) if sampled else roadmap.samples
-    # Between samples the margin is kept; to given points only the radius.
+    # Edges between samples keep the margin. Edges to given points keep only the radius.
     clear = np.full(len(pairs), roadmap.radius_m, np.float32)
     if roadmap.config.margin_m:
         clear += np.float32(roadmap.config.margin_m) * (pairs[:, 1] < samples)
@@ -271,7 +273,7 @@ def _connect(roadmap: Roadmap, points: np.ndarray, *, sampled: bool) -> Roadmap:
 
 
 def _new_pairs(points: np.ndarray, known: int, reach_m: float) -> np.ndarray:
-    """Pairs int32 [k, 2] of points at most ``reach_m`` [m] apart, first < second, the second not among the known."""
+    """Pairs int32 [k, 2] of points at most ``reach_m`` [m] apart: first < second, and the second is a new point."""
     tree = cKDTree(points)
     if not known:
         return tree.query_pairs(reach_m, output_type="ndarray").astype(np.int32)
@@ -282,22 +284,22 @@ def _new_pairs(points: np.ndarray, known: int, reach_m: float) -> np.ndarray:
 
 
 def as_space(maze: Maze | Space) -> Space:
-    """The maze, or what is a space already, as a space."""
+    """A maze as a space; a space is returned unchanged."""
     return MazeSpace(maze) if isinstance(maze, Maze) else maze
 
 
 @dataclass(frozen=True)
 class MazeSpace:
-    """A maze's compiled queries, in NumPy."""
+    """A maze as a ``Space``: compiled queries with NumPy arrays in and out."""
 
     maze: Maze
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """As ``Space`` says; at most one cell."""
+        """See ``Space``; the result is at most one cell."""
         return np.asarray(_clearances(self.maze, jnp.asarray(points, jnp.float32)))
 
     def segment_free(self, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """As ``Space`` says."""
+        """See ``Space``."""
         ends, radius = np.asarray(ends, np.float32), np.asarray(radius, np.float32)
         free, unclear = _in_blocks(functools.partial(_by_cells, self.maze), ends, radius)
         which = np.flatnonzero(unclear)
@@ -308,27 +310,27 @@ class MazeSpace:
         return free
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
-        """As ``Space`` says. Raises UserError where the cells are too narrow."""
+        """See ``Space``. Raises UserError if the cells are too narrow."""
         return _sample_points(rng, self.maze, radius, n)
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
-        """As ``Space`` says: 4-connected cells, whatever the radius, for a cell's width is larger."""
+        """See ``Space``: regions of 4-connected cells. The radius does not matter: a cell is wider than the robot."""
         del radius
         labels, _ = label_regions(~np.asarray(self.maze.walls))
         column, row = np.floor(np.asarray(points) / float(self.maze.cell_m)).astype(int).T
         return labels[row, column]
 
 
-_BLOCK = 32_768  # most edges that are checked at once: they stay in the processor's cache and share one program
+_BLOCK = 32_768  # most edges checked in one call: a block fits the processor's cache, and all share one program
 
 
 def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
-    """What a compiled check says of edges, ends [m, 2, 2] (m) and radii [m] (m): one or more bool [m]."""
+    """Run a compiled check on edges with ends [m, 2, 2] (m) and radii [m] (m), block by block: one or more bool [m]."""
     found = []
     for begin in range(0, max(len(ends), 1), _BLOCK):
         block, room = ends[begin : begin + _BLOCK], radius[begin : begin + _BLOCK]
         n = len(block)
-        whole = max(1024, 1 << (n - 1).bit_length())  # or three quarters of it: few programs serve all roadmaps
+        whole = max(1024, 1 << (n - 1).bit_length())  # pad to this or three quarters: few sizes, so few compilations
         more = (whole if n > 3 * whole // 4 else 3 * whole // 4) - n
         if more:
             block, room = np.pad(block, ((0, more), (0, 0), (0, 0))), np.pad(room, (0, more))
@@ -340,20 +342,20 @@ def _in_blocks(check: Callable[..., tuple[jax.Array, ...]], ends: np.ndarray, ra
 def _by_cells(
     maze: Maze, ends: Float[Array, "m 2 2"], radius: Float[Array, "m"]
 ) -> tuple[Bool[Array, "m"], Bool[Array, "m"]]:
-    """What the cells alone tell of edges: which are free for certain, and which want the exact check.
+    """A fast check of edges by cells: (surely free, undecided). The undecided ones need the exact check.
 
-    An edge is free where the box around it holds no wall, and is not where its middle or a quarter is in one.
+    An edge is free if the box around it holds no wall. It is blocked if its middle or a quarter point is in a wall.
     """
     height, width = maze.shape
     counts = jnp.pad(jnp.cumsum(jnp.cumsum(maze.walls, 0), 1), ((1, 0), (1, 0)))  # of walls below and left
 
     def index(points: Float[Array, "m 2"]) -> tuple[Int[Array, "m"], Int[Array, "m"]]:
-        """Cells of points [m]; the border is wall, and so is everything beyond it."""
+        """Cells of points [m]. Points outside get a border cell, which is wall."""
         row, column = (jnp.floor(points[:, i] / maze.cell_m).astype(jnp.int32) for i in (1, 0))
         return jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
 
     a, b = ends[:, 0], ends[:, 1]
-    around = radius[:, None] + 1e-4  # more than rounding: never free where the exact check would not be
+    around = radius[:, None] + 1e-4  # more than the rounding error, so this check is never laxer than the exact one
     (bottom, left), (top, right) = index(jnp.minimum(a, b) - around), index(jnp.maximum(a, b) + around)
     top, right = top + 1, right + 1
     free = counts[top, right] - counts[bottom, right] - counts[top, left] + counts[bottom, left] == 0
@@ -374,7 +376,7 @@ def _clearances(maze: Maze, points: Float[Array, "m 2"]) -> jax.Array:
 
 
 def _sample_points(rng: np.random.Generator, maze: Maze, radius: float, n: int) -> np.ndarray:
-    """n points uniform over the area with clearance ``radius``, by rejection."""
+    """n points, uniform over the area that has clearance ``radius``, by rejection sampling."""
     cell = float(maze.cell_m)
     free = np.argwhere(~np.asarray(maze.walls))[:, ::-1]
     kept: list[np.ndarray] = []
@@ -393,15 +395,15 @@ def _sample_points(rng: np.random.Generator, maze: Maze, radius: float, n: int) 
 
 
 def stack_tables(tables: list[PlanTable], largest: Callable[[int], int] = int) -> PlanTable:
-    """Tables stacked along a new leading axis. The smaller ones are filled up with points that nothing can see.
+    """Tables stacked along a new leading axis. Smaller tables are padded with points that nothing can see.
 
     Args:
-        largest: the largest of the numbers that several processes name, so that their tables fit together.
+        largest: maximum of a number over all processes, so that the tables of all have the same size.
     """
     sizes = np.array([table.next_hop.shape for table in tables])
     n, m = (largest(int(size)) for size in sizes.max(0))
     if (n, m) != tuple(-largest(-int(size)) for size in sizes.min(0)):
-        n += 1  # a row for the point that filled-up columns lead to
+        n += 1  # a row for the padding point that padded columns lead to
 
     def grow(table: PlanTable) -> PlanTable:
         rows, columns = n - table.next_hop.shape[0], m - table.next_hop.shape[1]
@@ -421,11 +423,11 @@ def stack_tables(tables: list[PlanTable], largest: Callable[[int], int] = int) -
 
 @struct.dataclass
 class Following:
-    """Where N environments are on their plans: their roadmaps, seen from their goals."""
+    """The plans of N environments: their roadmaps with the paths to their goals, and their current waypoints."""
 
     points: Float[Array, "N n 2"]  # [m]
     next_hop: Int[Array, "N n"]  # towards the goal
-    to_go: Float[Array, "N n"]  # way to the goal's point [m]
+    to_go: Float[Array, "N n"]  # path length to the goal's node [m]
     waypoint: Int[Array, "N"]
     goal_node: Int[Array, "N"]
 
@@ -434,13 +436,13 @@ class Following:
 class RoadmapGuide:
     """Gives each environment the next waypoint of its plan (paper, sec. III-A).
 
-    Plans follow the roadmap's shortest path, point after point. With ``shortcut`` the waypoint is instead, at every
-    step, the point in sight that makes the shortest way to the goal: smoother, and it recovers from any disturbance.
+    Plans follow the roadmap's shortest path, point after point. With ``shortcut`` the waypoint is chosen again at every
+    step: the visible point with the shortest path to the goal. This is smoother and recovers from any disturbance.
     """
 
     radius_m: float  # of the robot
-    margin_m: float = 0.0  # clearance beyond the radius on the way to a new waypoint, where its ends have the room [m]
-    look_m: float = 10.0  # farthest waypoint that is chosen anew [m]
+    margin_m: float = 0.0  # clearance beyond the radius on the way to a new waypoint, if both ends have that room [m]
+    look_m: float = 10.0  # largest distance of a newly chosen waypoint [m]
     cell_m: float = 4.0
     waypoint_tolerance_m: float = 0.5
     shortcut: bool = False
@@ -448,7 +450,7 @@ class RoadmapGuide:
     def init(
         self, tables: PlanTable, which: Int[Array, "N"], maze: Maze, position: jax.Array, goal: jax.Array
     ) -> Following:
-        """Connect starts and goals [N, 2] (m) to their roadmaps ``which``; ``maze`` has a leading axis N."""
+        """Connect starts and goals [N, 2] (m) to the roadmaps ``which``; ``maze`` has a leading axis N."""
         points, goals = tables.points[which], tables.goal[which]
         column = self._nearest_in_sight(jnp.take_along_axis(points, goals[..., None], 1), maze, goal)
         goal_node = jnp.take_along_axis(goals, column[:, None], 1)[:, 0]
@@ -464,13 +466,16 @@ class RoadmapGuide:
     def waypoint(
         self, plan: Following, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]
     ) -> tuple[Float[Array, "N 2"], Following]:
-        """Targets [N, 2] (m), and the plans with reached waypoints passed and lost ones chosen anew."""
+        """Targets [N, 2] (m), and the plans after this step.
+
+        A plan goes on to the next waypoint when one is reached, and chooses another when one is out of sight.
+        """
         row = jnp.arange(len(plan.waypoint))
         away = jnp.linalg.norm(plan.points[row, plan.waypoint] - position, axis=-1)
         hop = plan.next_hop[row, plan.waypoint]
         waypoint = jnp.where((away < self.waypoint_tolerance_m) & (hop != NO_HOP), hop, plan.waypoint)
         kept = plan.points[row, waypoint]
-        # A waypoint is chosen with the margin and kept without it: else a robot beside its path would turn back.
+        # The margin is needed to choose a waypoint, not to keep it. Otherwise a robot beside its path would turn back.
         kept_seen = self._sees(maze, position, kept[:, None], self._keep_m)[:, 0]
         way = jnp.where(kept_seen, jnp.linalg.norm(kept - position, axis=-1) + plan.to_go[row, waypoint], jnp.inf)
         better = jnp.inf if not self.shortcut else 1e-3
@@ -489,9 +494,9 @@ class RoadmapGuide:
         return 0.8 * self.radius_m
 
     def _choose(self, plan: Following, maze: Maze, position: jax.Array) -> tuple[Int[Array, "N"], Float[Array, "N"]]:
-        """The point in sight that makes the shortest way to the goal, and that way [m].
+        """The visible point with the shortest path to the goal, and the length of that path [m].
 
-        Where none is in sight, the nearest point, and infinity.
+        If no point is visible: the nearest point, and infinity.
         """
         away = jnp.linalg.norm(plan.points - position[:, None], axis=-1)
         _, near = jax.lax.top_k(-away, min(_CANDIDATES, away.shape[1]))
@@ -499,7 +504,7 @@ class RoadmapGuide:
         points = jnp.take_along_axis(plan.points, near[..., None], 1)
         free = self._sees(maze, position, points, self.radius_m + self.margin_m) & (pick(away) <= self.look_m)
         way = jnp.where(free, pick(away) + pick(plan.to_go), jnp.inf)
-        best = jnp.argmin(way, -1)[:, None]  # all infinite: the first, which is the nearest
+        best = jnp.argmin(way, -1)[:, None]  # if all are infinite: the first, which is the nearest
         return jnp.take_along_axis(near, best, 1)[:, 0], jnp.take_along_axis(way, best, 1)[:, 0]
 
     def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: jax.Array) -> Int[Array, "N"]:

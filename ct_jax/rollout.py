@@ -1,4 +1,4 @@
-"""The one scan that steps environments under a policy."""
+"""Rolling out a policy in the maze environments: the one scan that steps them."""
 
 import functools
 from typing import Any, NamedTuple, Protocol
@@ -16,34 +16,34 @@ from ct_jax.devices import sharded
 
 
 class Action(NamedTuple):
-    """What a policy meant to do, what is done (they differ by a disturbance), and what should be imitated."""
+    """The action that a policy intended, the action executed (with a disturbance), and the action to imitate."""
 
     meant: Float[Array, "N A"]
     done: Float[Array, "N A"]
     target: Float[Array, "N A"]
-    learn: Float[Array, "N"]  # 1 where the target is to be imitated, else 0
+    learn: Float[Array, "N"]  # 1 if the target is to be imitated, else 0
 
 
 def act_as_meant(action: Float[Array, "N A"]) -> Action:
-    """An action without disturbance, itself to be imitated."""
+    """An action that is executed without disturbance and imitated as it is."""
     return Action(action, action, action, jnp.ones(action.shape[:1]))
 
 
 class Policy(Protocol):
-    """Acts in N environments at once. A pytree; its memory of the episode is another."""
+    """Acts in N environments at once. The policy and its memory of the episode are two pytrees."""
 
     def act(self, memory: Any, state: State, key: jax.Array) -> tuple[Action, Any]:
-        """Actions for N states, and the memory after them."""
+        """Actions for N states, and the next memory."""
         ...
 
 
 @struct.dataclass
 class Steps:
-    """What happened, time first: [T, N, ...]. State before the action, outcome after it."""
+    """The record of a rollout, time first: [T, N, ...]. States are before the action, outcomes after it."""
 
     position: Float[Array, "T N 2"]
     proprio: Float[Array, "T N P"]
-    action: Float[Array, "T N A"]  # as meant; 0 where that is not finite
+    action: Float[Array, "T N A"]  # as intended, without disturbance; 0 where that is not finite
     target: Float[Array, "T N A"]  # to be imitated; 0 where it is not finite
     reward: Float[Array, "T N"]
     learn: Float[Array, "T N"]  # 1 where the target is to be imitated and finite
@@ -65,13 +65,13 @@ def broke_off(info: dict[str, Any]) -> Float[Array, "*b"]:
 def rollout(
     env: MazeEnv, policy: Policy, state: State, memory: Any, key: jax.Array, length: int, mesh: Mesh | None = None
 ) -> tuple[State, Any, Steps]:
-    """Step N environments ``length`` times (static). Environments without auto-reset stay where they finished.
+    """Step N environments ``length`` times (static). Without auto-reset, an environment stays in its final state.
 
     Args:
-        mesh: the devices that share the environments evenly. Which device steps one changes nothing of what happens.
+        mesh: the devices that share the environments evenly. The result does not depend on it.
     """
     step = jax.vmap(env.step)
-    if mesh is not None and mesh.size > 1:  # each steps its own: XLA would not split the calls of MuJoCo by itself
+    if mesh is not None and mesh.size > 1:  # each device steps its share: XLA cannot split the calls of MuJoCo itself
         spec = sharded(mesh).spec
         step = jax.shard_map(step, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
@@ -101,40 +101,40 @@ def rollout(
 
 
 class Controller(Protocol):
-    """pi_c. A pytree, so that its parameters are arguments of compiled programs."""
+    """The low-level controller pi_c. It is a pytree, so its parameters are arguments of compiled programs."""
 
     action_size: int
 
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
-        """Actions from proprioception and the vector to a goal close by [m]."""
+        """Actions from proprioception and the vector to a nearby goal [m]."""
         ...
 
 
 class Guide(Protocol):
-    """A planner, asked at every step for the next waypoint."""
+    """A planner. It gives the next waypoint at every step."""
 
     def waypoint(
         self, memory: Any, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]
     ) -> tuple[Float[Array, "N 2"], Any]:
-        """Targets [m], and the guide's memory after them."""
+        """Targets [m], and the guide's next memory."""
         ...
 
 
 @struct.dataclass
 class Guided:
-    """The controller led by a planner (paper, sec. III-A). Its memory is (the guide's, the disturbance [N, A])."""
+    """The controller guided by a planner (paper, sec. III-A). Memory: the guide's memory, the disturbance [N, A]."""
 
     controller: Controller
     guide: Guide = struct.field(pytree_node=False)
-    noise: float = struct.field(pytree_node=False, default=0.0)  # size of the disturbance of the actions
-    hold: float = struct.field(pytree_node=False, default=0.9)  # chance that it stays as it is for another step
+    noise: float = struct.field(pytree_node=False, default=0.0)  # standard deviation of the disturbance of actions
+    hold: float = struct.field(pytree_node=False, default=0.9)  # chance that the disturbance is kept for another step
 
     def init(self, state: State, guide_memory: Any) -> tuple[Any, jax.Array]:
         n = state.done.shape[0]
         return guide_memory, jnp.zeros((n, self.controller.action_size))
 
     def intend(self, guide_memory: Any, state: State) -> tuple[jax.Array, Any]:
-        """What the controller would do, undisturbed."""
+        """The controller's action without disturbance."""
         position = state.info["position"]
         target, guide_memory = self.guide.waypoint(guide_memory, state.info["maze"], position, state.info["goal"])
         return self.controller(state.obs["proprio"], target - position), guide_memory  # pyright: ignore

@@ -49,7 +49,7 @@ class RoomCourse:
         return self.run.settings.rooms or RoomConfig()
 
     def controller(self, metrics: Metrics) -> tuple[DifferentialDrive, SacConfig]:
-        """The known controller (paper, sec. IV-D)."""
+        """The known controller (paper, sec. IV-B)."""
         del metrics
         return DifferentialDrive(), self.run.settings.sac
 

@@ -1,8 +1,8 @@
-"""Trajectories in memory: padded arrays that can be sharded, with the local maps of mazes left out.
+"""Trajectories in memory: padded arrays that can be sharded. They do not hold the local maps of mazes.
 
-The map of a maze is a function of the robot's position, so it is recomputed, exactly, when a window is drawn: a
-thousand trajectories take megabytes, not gigabytes. What a lidar showed cannot be recomputed: it is kept, eight cells
-to the byte.
+The local map in a maze is a function of the robot's position, so it is recomputed, exactly, when a window is drawn: a
+thousand trajectories take megabytes, not gigabytes. Lidar maps cannot be recomputed: they are kept, with eight cells in
+a byte.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
 _MAP_BITS = 2 * MAP_CELLS**2
 
 PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
-OBSERVED = ("seen", "map_bits")  # per step, too, where they are kept
+OBSERVED = ("seen", "map_bits")  # also per step; only in trajectories that keep their maps
 
 # Axes and kinds of the arrays of ``Trajectories``.
 _ARRAYS: dict[str, tuple[tuple[str | int, ...], type[np.generic]]] = {
@@ -39,20 +39,20 @@ _ARRAYS: dict[str, tuple[tuple[str | int, ...], type[np.generic]]] = {
 
 @struct.dataclass
 class Trajectories:
-    """N trajectories of at most T steps; entries at and after ``length`` mean nothing."""
+    """N trajectories of at most T steps; entries at and after ``length`` are padding."""
 
     position: Float[Array, "N T 2"]  # before the action [m]
     proprio: Float[Array, "N T P"]
-    action: Float[Array, "N T A"]  # as meant: a later step's past
-    target: Float[Array, "N T A"]  # to be imitated; the action itself, unless somebody knew better
+    action: Float[Array, "N T A"]  # as intended, without disturbance; input of later steps
+    target: Float[Array, "N T A"]  # to be imitated: the action itself, or the planner's (DAgger)
     reward: Float[Array, "N T"]  # after the action
-    learn: Float[Array, "N T"]  # 1 where the target is to be imitated
+    learn: Float[Array, "N T"]  # 1 if the target is to be imitated
     collision: Float[Array, "N T"]
     goal: Float[Array, "N 2"]  # final goal [m]
     maze: Int[Array, "N"]  # index into the mazes
     length: Int[Array, "N"]
-    # What cannot be recomputed from a maze; both or neither.
-    seen: Float[Array, "N T 2"] | None = None  # vector to the final goal, as it was observed [m]
+    # Observations that cannot be recomputed from a maze; both are given or neither.
+    seen: Float[Array, "N T 2"] | None = None  # observed vector to the final goal [m]
     map_bits: UInt8[Array, "N T 157"] | None = None  # see ``pack_maps``
 
     @property
@@ -72,17 +72,17 @@ class Trajectories:
 
 
 def pack_maps(maps: UInt8[np.ndarray, "*b 2 k k"]) -> UInt8[np.ndarray, "*b 157"]:
-    """Local maps with eight cells to the byte."""
+    """Local maps with eight cells in a byte."""
     return np.packbits(maps.reshape(*maps.shape[:-3], -1), axis=-1)
 
 
 def unpack_maps(bits: UInt8[Array, "*b 157"]) -> UInt8[Array, "*b 2 k k"]:
-    """The inverse of ``pack_maps``, under jit, too."""
+    """The inverse of ``pack_maps``; also works under jit."""
     return jnp.unpackbits(bits, axis=-1, count=_MAP_BITS).reshape(*bits.shape[:-1], *_MAP_SHAPE)
 
 
 def at_goal(reward: jax.Array | np.ndarray, tolerance_m: float) -> jax.Array | np.ndarray:
-    """Whether a step's reward, minus the distance to the goal after it [m], tells of an arrival."""
+    """Whether the robot is at its goal after a step. The reward is minus the distance to the goal [m]."""
     return reward > -tolerance_m
 
 
@@ -92,14 +92,14 @@ def select(trajectories: Trajectories, index: np.ndarray) -> Trajectories:
 
 
 def concatenate(parts: list[Trajectories]) -> Trajectories:
-    """All trajectories of ``parts``, padded to the longest and no longer."""
+    """All trajectories of ``parts``, padded to the length of the longest."""
     longest = max(int(np.max(np.asarray(part.length), initial=1)) for part in parts)
     fitted = [pad(part, part.n, -(-longest // _PAD_STEPS) * _PAD_STEPS) for part in parts]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *fitted)
 
 
 def pad(trajectories: Trajectories, n: int, steps: int) -> Trajectories:
-    """The same data in arrays of n trajectories (the further ones empty: never drawn) and of this many steps."""
+    """The same data in arrays of n trajectories and this many steps. Added trajectories are empty and never drawn."""
 
     def fit(name: str, leaf: np.ndarray) -> np.ndarray:
         if name in (*PER_STEP, *OBSERVED):
@@ -111,7 +111,7 @@ def pad(trajectories: Trajectories, n: int, steps: int) -> Trajectories:
 
 
 def arrays_of(trajectories: Trajectories) -> dict[str, np.ndarray]:
-    """The arrays that are there, by name."""
+    """The arrays that are present, by name."""
     leaves = {name: getattr(trajectories, name) for name in Trajectories.__dataclass_fields__}
     return {name: np.asarray(leaf) for name, leaf in leaves.items() if leaf is not None}
 
@@ -202,7 +202,7 @@ def _wrong(found: dict[str, np.ndarray]) -> str:
 
 @struct.dataclass
 class Window:
-    """A batch of pieces of trajectories, S steps each."""
+    """A batch of windows of trajectories, S steps each."""
 
     map: UInt8[Array, "B S 2 k k"]
     proprio: Float[Array, "B S P"]
@@ -211,8 +211,8 @@ class Window:
     target: Float[Array, "B S A"]
     rtg: Float[Array, "B S"]
     timestep: Int[Array, "B S"]
-    valid: Float[Array, "B S"]  # 1 where there is a step
-    learn: Float[Array, "B S"]  # 1 where the target is to be imitated
+    valid: Float[Array, "B S"]  # 1 if the step exists, 0 for padding
+    learn: Float[Array, "B S"]  # 1 if the target is to be imitated
     reward: Float[Array, "B S"]  # after the action
 
 
@@ -230,25 +230,26 @@ def sample_windows(
     overhang: int = 0,
     stride: int = 1,
 ) -> Window:
-    """Draw pieces of ``steps`` steps: a trajectory by its length, and of it no step less often than another.
+    """Draw windows of ``steps`` steps. Every step of the data is equally likely to be in one.
 
     Args:
         rtg: ``trajectories.rtg``, computed once.
-        mazes: stacked; ``trajectories.maze`` points into it. Not needed where the trajectories keep their maps.
-        symmetries: also turn and reflect each piece, robot and maze alike, by a random one of these.
-        shift_timestep: add to a piece's timesteps a random number up to this, so that late embeddings are learned.
-        overhang: steps of a piece that may lie beyond its trajectory's end, so that the last one is a first one, too.
-        stride: from one step of a piece to the next.
+        mazes: stacked; ``trajectories.maze`` is an index into it. Not needed if the trajectories keep their maps.
+        symmetries: also turn and reflect each window, robot and maze together, by a random symmetry of these.
+        shift_timestep: add a random number up to this to a window's timesteps, so that late embeddings are learned.
+        overhang: how many steps of a window may lie beyond the end of its trajectory. With ``steps - 1``, the last step
+            can also be the first of a window.
+        stride: control steps from one step of a window to the next.
     """
     which_key, where_key, mirror_key, shift_key, origin_key = jax.random.split(key, 5)
     share = jnp.cumsum(trajectories.length)
     which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
     length = trajectories.length[which]
-    # Of a trajectory, the steps from one of the first few on by strides are one to draw from.
+    # A window takes every ``stride``-th step of its trajectory, counted from a random one of the first few.
     origin = jax.random.randint(origin_key, (batch,), 0, jnp.minimum(stride, length))
     count = (length - origin + stride - 1) // stride
-    # Pieces may begin at any step that leaves them full, or at the start of a short trajectory. Those that would hang
-    # over an end are moved inside: else first and last steps would be in one piece of many that hold a middle one.
+    # A window begins at any step that leaves it full, or at the start of a short trajectory. A window that would reach
+    # over an end is moved inside. Otherwise the first and last steps would be in fewer windows than the middle ones.
     last, beyond = jnp.maximum(count + overhang - steps, 0), steps - 1 - overhang
     drawn = jax.random.uniform(where_key, (batch,)) * (last + 1 + 2 * beyond)
     first = jnp.clip(drawn.astype(jnp.int32) - beyond, 0, last)
@@ -281,7 +282,7 @@ def _see(
     trajectories: Trajectories, mazes: Maze | None, which: Int[Array, "B"], position: Float[Array, "B S 2"],
     map_cell_m: float,
 ) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:  # fmt: skip
-    """Local maps and vectors to the goal [m] at positions [m] in the mazes of the trajectories ``which``."""
+    """Local maps and vectors to the goal [m], at positions [m] in the mazes of the trajectories ``which``."""
     goal = trajectories.goal[which]
     maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
     see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
@@ -289,7 +290,7 @@ def _see(
 
 
 def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Window) -> Window:
-    """Apply the symmetries ``which`` of a robot to pieces of its trajectories and their maps."""
+    """Apply the symmetries ``which`` of a robot to windows of its trajectories, maps included."""
     world, proprio, action = (jnp.asarray(matrices)[which] for matrices in symmetries)
 
     def grid(values: jax.Array) -> jax.Array:

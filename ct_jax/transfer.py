@@ -1,4 +1,4 @@
-"""Transfer to another robot (paper, sec. IV-E): what was learned of mazes stays, what is the body's begins anew."""
+"""Transfer to another robot (paper, sec. IV-A): weights for mazes are kept, weights for the body start fresh."""
 
 from typing import Any
 
@@ -11,16 +11,18 @@ BODY = ("embed_state", "embed_action", "predict_action", "predict_mode", "head")
 
 
 def transfer(source: Any, fresh: Any) -> Any:
-    """Parameters of a ``ControlTransformer`` for another robot: the trunk, convolutions and embeddings of return, goal
-    and time of ``source``; the embeddings of state and action and the action head of ``fresh``.
+    """Parameters of a ``ControlTransformer`` for another robot.
+
+    The trunk, the convolutions and the embeddings of return, goal and time come from ``source``. The embeddings of
+    state and action and the action head come from ``fresh``.
 
     Raises:
-        UserError: the two differ in more than the robot: layers, widths or lengths (both shapes are shown).
+        UserError: the two models differ in layers, widths or lengths (the message shows both shapes).
     """
     old, new = source["params"], fresh["params"]
     kept = {name: leaves for name, leaves in new.items() if name not in BODY}
     if kept.keys() != {name for name in old if name not in BODY}:
-        raise UserError("the two transformers differ in their layers; transfer between models of one size")
+        raise UserError("the two transformers have different layers; transfer between models of the same size")
 
     def take(path: tuple[Any, ...], leaf: Any, wanted: Any) -> Any:
         if np.shape(leaf) != np.shape(wanted):

@@ -1,4 +1,4 @@
-"""Control Transformer: a return-conditioned causal transformer (paper, sec. III-C and E).
+"""Control Transformer: a return-conditioned causal transformer (paper, sec. III-D and III-F).
 
 Attention is causal and *banded*: a token of step t attends to tokens of steps t - K + 1 ... t that come before it. With
 a ``stride`` of s it attends to steps t, t - s, t - 2s and so on, K of them: s times the memory at the cost of one.
@@ -36,7 +36,7 @@ SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
 
 @dataclass(frozen=True)
 class ModelConfig(Checked):
-    """Sizes of the transformer (paper, table II)."""
+    """Sizes of the transformer (paper, table I)."""
 
     layers: Annotated[int, Within(1, 64)] = 4
     heads: Annotated[int, Within(1, 64)] = 4
@@ -139,7 +139,7 @@ def goal_features(goal: Float[Array, "*b 2"]) -> Float[Array, "*b 6"]:
 
 
 class Block(nn.Module):
-    """Pre-norm attention and MLP with ReLU (paper, table II)."""
+    """Pre-norm attention and MLP with ReLU (paper, table I)."""
 
     config: ModelConfig
     dtype: DTypeLike | None = None

@@ -1,4 +1,4 @@
-"""The value network V_phi(s | g): the mean return of the data from a first observation (paper, sec. III-C, E)."""
+"""The value network V_phi(s | g): the mean return of the data, from one observation (paper, sec. III-D and III-F)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder, goal_feat
 
 
 class ValueNetwork(nn.Module):
-    """Undiscounted return from a local map, proprioception and goal; knows nothing of the past."""
+    """Undiscounted return, predicted from a local map, proprioception and goal. It has no memory."""
 
     width: int = 128
 

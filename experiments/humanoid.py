@@ -3,7 +3,7 @@
 
     python experiments/humanoid.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--controller own|zoo]
 
-With ``--preset cpu`` every row of the paper's table is trained at a CPU's size on 1000 guided trajectories: CT as
+With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
 published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. A planner and an
 explorer stand beside them. All methods meet the same 100 start-goal pairs. A low-level controller of your own takes
 hours on one core and can be interrupted at any time; ``--controller zoo`` takes the shipped one. ``zoo:humanoid`` is

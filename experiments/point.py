@@ -2,7 +2,7 @@
 
     python experiments/point.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--variants published cpu]
 
-With ``--preset cpu`` every row of the paper's table is trained at a CPU's size on 1000 guided trajectories: CT as
+With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
 published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without (``cpu-ct``) and with fine-tuning
 (``cpu``). A planner and an explorer stand beside them. All methods meet the same 100 start-goal pairs. ``zoo:point``
 is ``mazes-ct``. Writes ``experiments/results/point-PRESET.json``.

@@ -18,7 +18,7 @@ from ct_jax.evaluate import GUIDED
 
 ZOO = Path(__file__).parents[1] / "ct_jax" / "zoo"
 LONGER = "long-ct"  # CT with about as many updates as F-CT has in all
-# Success of the paper's CT [%], sec. IV; and the lifted variants, without and with fine-tuning.
+# Success of the paper's CT [%] (sec. IV-A, table II; sec. IV-B); and the lifted variants, without and with fine-tuning.
 PAPER = {
     "point": {"antmaze-large": 84.33, "antmaze-large-eval": 60.33},
     "ant": {"antmaze-large": 90.0, "antmaze-large-eval": 77.33},

@@ -1,4 +1,4 @@
-"""Transfer between the point robot and the ant (paper, sec. IV-A, its figure): success against updates.
+"""Transfer between the point robot and the ant (paper, sec. IV-A, figure 6): success against updates.
 
     python experiments/transfer.py [--robots ant point] [--point runs/point/cpu-0] [--ant runs/ant/cpu-0]
 

@@ -80,7 +80,7 @@ def test_a_controller_that_never_arrives_is_an_error_and_no_hang(push):
     """One that stands still; and exactly as many episodes as it was given."""
     seen = []
     config = replace(SMALL, trajectories=4, give_up=4.0, starts="maze")
-    with pytest.raises(UserError, match=r"reached only \d of 16 goals, 4 were asked for"):
+    with pytest.raises(UserError, match=r"reached only \d of 16 goals, but 4 are needed"):
         collect(jax.random.key(0), ENV, MAZES, push(0.0), config, PRM, on_progress=lambda *counts: seen.append(counts))
     assert [of for _, of in seen] == [8, 16]
 

@@ -146,6 +146,6 @@ def test_processes_that_cannot_share_a_batch_are_told(monkeypatch):
             self.process_index, self.id = process, process
 
     monkeypatch.setattr(jax, "devices", lambda: [Device(i) for i in range(3)])
-    with pytest.raises(UserError, match="a batch of 4 cannot be shared by 3 processes"):
+    with pytest.raises(UserError, match="3 processes cannot share a batch of 4 evenly"):
         devices.data_mesh(4)
     assert devices.data_mesh(6).size == 3

@@ -52,7 +52,7 @@ def test_models_of_other_sizes_are_refused(changes):
 
 
 def test_models_of_other_depths_are_refused():
-    with pytest.raises(UserError, match="differ in their layers"):
+    with pytest.raises(UserError, match="different layers"):
         transfer(params(0, 2, 2), params(1, 27, 8, layers=2))
 
 

@@ -1,1 +1,1 @@
-"""What the transformer is compared with: offline and online reinforcement learning (paper, sec. IV-B)."""
+"""The baselines of the transformer: offline and online reinforcement learning (paper, sec. IV-A)."""

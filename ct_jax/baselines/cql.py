@@ -1,15 +1,15 @@
-"""PT-CQL: conservative Q-learning on the planner-guided trajectories (paper, sec. IV-B; Kumar et al., 2020).
+"""PT-CQL: conservative Q-learning on the planner-guided trajectories (paper, sec. IV-A; Kumar et al., 2020).
 
-The same trajectories, final goals and reward -||g|| as for the transformer, as single steps (s, a, r, s'). An episode
-is over at its goal and nowhere else. What the critics say of actions that the data do not hold is pushed down: CQL(H),
-with the soft maximum over all actions estimated from uniform ones and from the policy's, each weighted by its density.
+The data are the transformer's trajectories, with the same final goals and reward -||g||, as single steps (s, a, r, s').
+An episode ends only at its goal. The method is CQL(H): it lowers the critics' values of actions that are not in the
+data. The soft maximum over all actions is estimated from uniform samples and from samples of the policy, each weighted
+by its density.
 
-Settings. Learning rate, batch, discount, number of sampled actions, importance weights, ``alpha=5``, a temperature that
-adapts, and no entropy in the targets are the defaults of the implementation that the paper used (github.com/young-geng/
-cql). It takes rewards as they are, for tasks whose rewards are of order one; ours are tens of metres a step, so
-``reward_scale=0.1`` brings them there. The target entropy, -1 for each action, is SAC's own. ``alpha``, and a target
-rate that suits thousands of updates instead of a million, were chosen by ``experiments/cql.py`` in the point's training
-maze; the ant walked to no goal with any.
+Settings. Learning rate, batch, discount, number of sampled actions, importance weights, ``alpha=5``, the adaptive
+temperature, and targets without entropy are the defaults of the implementation that the paper used (github.com/
+young-geng/cql). It expects rewards of order one; ours are tens of metres a step, so ``reward_scale=0.1``. The target
+entropy, -1 for each action, is SAC's. ``alpha`` and a target rate for thousands of updates instead of a million were
+chosen by ``experiments/cql.py`` in the point's training maze; with none of them did the ant reach a goal.
 """
 
 from collections.abc import Callable
@@ -37,31 +37,30 @@ class CqlConfig(Checked):
     """Conservative Q-learning."""
 
     updates: Count = 20_000
-    batch: Annotated[int, Within(1, 1_000_000)] = 256  # steps of trajectories
+    batch: Annotated[int, Within(1, 1_000_000)] = 256  # number of single steps in a batch
     learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # of policy, critics and temperature
     width: Annotated[int, Within(1, 16_384)] = 128  # of all layers
     discount: Share = 0.99
     reward_scale: Annotated[float, Above(0, 1_000_000)] = 0.1  # of the reward [m] in the critics' units
     alpha: Annotated[float, Within(0, 1_000_000)] = 5.0  # weight of the conservative penalty against the squared error
     samples: Annotated[int, Within(1, 10_000)] = (
-        10  # actions of each kind (uniform, the policy's now, the policy's next)
+        10  # for the penalty: number of actions of each kind (uniform, policy at s, policy at s')
     )
-    # behind the penalty
     target_rate: Annotated[float, Above(0, 1)] = 0.05  # share of the new critics in the target critics at each update
-    temperature: Annotated[float, Within(0, 1000)] = 1.0  # weight of the policy's entropy, at first; 0: no entropy term
+    temperature: Annotated[float, Within(0, 1000)] = 1.0  # initial weight of the policy's entropy; 0: no entropy term
     entropy: Annotated[
         float, Within(-1000, 1000)
-    ] = -1.0  # entropy for each action [nats] towards which the temperature is adapted
-    soft_target: bool = False  # count the entropy in the targets, too
-    imitation: Annotated[int, Within(0, 10**9)] = 0  # first updates in which the policy imitates the data, while the
-    # critics find their feet
+    ] = -1.0  # target entropy for each action dimension [nats]; the temperature adapts to it
+    soft_target: bool = False  # include the entropy in the critics' targets
+    imitation: Annotated[int, Within(0, 10**9)] = 0  # number of first updates in which the policy imitates the data,
+    # until the critics are useful
     mirror: bool = False  # turn and reflect steps by a random symmetry of the robot
-    frame: FrameName = "world"  # with "heading" the body is felt, and moved, in the robot's own frame
+    frame: FrameName = "world"  # "heading": proprioception and actions are in the robot's own frame
 
 
 @struct.dataclass
 class Learned:
-    """What gradients change."""
+    """The parameters that are learned by gradient descent."""
 
     actor: Any
     critics: Any
@@ -70,10 +69,10 @@ class Learned:
 
 @struct.dataclass
 class CqlState:
-    """Everything that training needs to go on."""
+    """The complete state of training, from which it can continue."""
 
     params: Learned
-    target: Any  # the critics, following slowly
+    target: Any  # target critics: a moving average of the critics
     optimizer: Any
     key: jax.Array
     update: jax.Array
@@ -81,20 +80,20 @@ class CqlState:
 
 @struct.dataclass
 class Transitions:
-    """Steps of trajectories, and what came after them."""
+    """Single steps of trajectories, with the observations before and after."""
 
     now: Seen
     action: Float[Array, "B A"]
     reward: Float[Array, "B"]  # [m]
     after: Seen
-    arrived: Float[Array, "B"]  # 1 where the goal was reached: nothing comes after
-    known: Float[Array, "B"]  # 0 where the trajectory was cut short: nobody knows what came after
+    arrived: Float[Array, "B"]  # 1 if the step reached the goal, where the episode ends
+    known: Float[Array, "B"]  # 0 if the trajectory was cut off here, so the next observation is unknown
 
 
 def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
-    """Pieces of two steps as transitions. The second may lie beyond the end, and then means nothing.
+    """Windows of two steps as transitions. The second step may lie beyond the trajectory's end; then it is not used.
 
-    The reward tells an arrival from a trajectory that was cut short.
+    The reward of the last step shows whether it arrived or was cut off.
     """
     see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal[:, i])  # noqa: E731
     reward, last = window.reward[:, 0], 1.0 - window.valid[:, 1]
@@ -126,13 +125,13 @@ class Cql:
         return place(jax.tree.map(jnp.array, state), replicated(self.mesh))
 
     def policy(self, state: CqlState) -> ActorPolicy:
-        """The policy learned so far."""
+        """The policy in this state."""
         return ActorPolicy(state.params.actor, self.action_size, self.config.width, self.config.frame)
 
     def _train(
         self, state: CqlState, data: Trajectories, mazes: Maze, updates: int
     ) -> tuple[CqlState, dict[str, jax.Array]]:
-        """Run some updates (static); returns means over them."""
+        """Run ``updates`` updates (static); returns the state and mean metrics."""
         state, info = jax.lax.scan(lambda s, _: self._update(s, data, mazes), state, length=updates)
         return state, jax.tree.map(jnp.mean, info)
 
@@ -153,7 +152,7 @@ class Cql:
     def _loss(
         self, params: Learned, state: CqlState, batch: Transitions, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The three losses together; each one's gradient moves its own parameters only."""
+        """The sum of the losses. The gradient of each changes only its own parameters."""
         critic_key, actor_key = jax.random.split(key)
         mean = lambda values: jnp.sum(values * batch.known) / jnp.maximum(jnp.sum(batch.known), 1.0)  # noqa: E731
         error, gap, q = self._critic_losses(params, state.target, batch, critic_key)
@@ -167,7 +166,7 @@ class Cql:
     def _critic_losses(
         self, params: Learned, target: Any, batch: Transitions, key: jax.Array
     ) -> tuple[Float[Array, "B"], Float[Array, "B"], Float[Array, "B"]]:
-        """Squared error against the target critics, the conservative penalty, and Q of the data, for each step."""
+        """For each step: squared error to the target, conservative penalty, and Q of the action in the data."""
         config = self.config
         next_key, uniform_key, here_key, there_key = jax.random.split(key, 4)
         here, there = (
@@ -195,13 +194,13 @@ class Cql:
     def _actor_loss(
         self, params: Learned, update: jax.Array, batch: Transitions, key: jax.Array
     ) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
-        """The policy's loss and its entropy, for each step: high values, or at first the actions of the data."""
+        """The policy's loss and entropy for each step. It maximises Q or, in the first updates, imitates the data."""
         temperature, critics = jax.lax.stop_gradient((jnp.exp(params.log_temperature), params.critics))
         logits: Any = self.actor.apply(params.actor, batch.now)
         action, log_density = self._draw(key, logits, 1)
         value = self.critics.apply(critics, batch.now, action).min(-1)[:, 0]  # pyright: ignore
         if self.config.imitation:
-            # An action at the very bound lies at infinity before the tanh.
+            # The inverse of tanh is infinite at the bounds, so clip the actions.
             done = self.distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
             value = jnp.where(update < self.config.imitation, self.distribution.log_prob(logits, done), value)
         return temperature * log_density[:, 0] - value, -log_density[:, 0]
@@ -209,7 +208,7 @@ class Cql:
     def _draw(
         self, key: jax.Array, logits: Float[Array, "B 2A"], n: int
     ) -> tuple[Float[Array, "B n A"], Float[Array, "B n"]]:
-        """Actions of the policy, and the logarithm of their density."""
+        """n actions of the policy, and their log-densities."""
         logits = jnp.repeat(logits[:, None], n, 1)
         raw = self.distribution.sample_no_postprocessing(logits, key)
         return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
@@ -225,13 +224,13 @@ def train_cql(
     checkpoints: Checkpoints | None = None,
     chunk: int = 20,
 ) -> ActorPolicy:
-    """Train to the configured number of updates.
+    """Train for the configured number of updates.
 
     Args:
-        data: rewards -||g|| to the final goal; what was cut short before its goal counts but for its last step.
-        mazes: stacked; ``data.maze`` points into it.
-        on_progress: told (updates done, metrics) after every ``chunk``.
-        checkpoints: where to go on from, and where to save now and then and when interrupted.
+        data: rewards are -||g|| to the final goal. The last step of a trajectory that did not arrive is not used.
+        mazes: stacked; ``data.maze`` is an index into it.
+        on_progress: called with (updates done, metrics) after every ``chunk``.
+        checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
     state = learner.create(key, data)
     data, mazes = place((data, mazes), replicated(learner.mesh))

@@ -1,4 +1,4 @@
-"""Actor and critics of the baselines: they see what the transformer sees, with the same map encoder, and no past."""
+"""Actor and critics of the baselines. They have the transformer's inputs and map encoder, but no memory."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_featu
 
 
 class Seen(NamedTuple):
-    """What a policy sees."""
+    """One observation."""
 
     map: UInt8[Array, "*b 2 k k"]
     proprio: Float[Array, "*b P"]
@@ -24,19 +24,19 @@ class Seen(NamedTuple):
 
 
 def sample_seen(proprio_size: int) -> Seen:
-    """One observation, from which parameters are initialised."""
+    """An observation of zeros, to initialise parameters."""
     return Seen(jnp.zeros((1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8), jnp.zeros((1, proprio_size)), jnp.zeros((1, 2)))
 
 
 def tanh_gaussian(action_size: int) -> NormalTanhDistribution:
-    """The distribution whose parameters an ``Actor`` gives; its samples are actions before the tanh."""
+    """The distribution of actions. An ``Actor`` gives its parameters."""
     return NormalTanhDistribution(action_size)
 
 
 def _perceive(seen: Seen, width: int, frame: str) -> Float[Array, "*b F"]:
-    """A first hidden layer over everything seen; inside a module.
+    """The first hidden layer over an observation. Call it inside a module.
 
-    With ``frame="heading"`` as in the transformer: where to go in the world, turned into the robot's own frame.
+    With ``frame="heading"``, directions in the world are turned into the robot's own frame, as in the transformer.
     """
     distance = jnp.linalg.norm(seen.goal, axis=-1, keepdims=True) / GOAL_SCALE_M
     place = [MapEncoder(width)(seen.map), goal_features(seen.goal), distance]
@@ -63,7 +63,7 @@ class Actor(nn.Module):
 
 
 class Critics(nn.Module):
-    """Two Q(s, a | g) over one map encoder, each of M actions in the same state."""
+    """Two critics Q(s, a | g) that share a map encoder. Each evaluates M actions in the same state."""
 
     width: int
     frame: str = "world"
@@ -74,7 +74,7 @@ class Critics(nn.Module):
         x = _perceive(seen, self.width, self.frame)[..., None, :]
         values = []
         for _ in range(2):
-            # A dense layer of both, written as a sum: the state's share is computed once for its M actions.
+            # A dense layer of state and action, written as a sum: the state's part is computed once for all M actions.
             y = nn.relu(nn.Dense(self.width)(x) + nn.Dense(self.width, use_bias=False)(action))
             y = nn.LayerNorm()(y) if self.norm else y
             y = nn.relu(nn.Dense(self.width)(y))
@@ -85,7 +85,7 @@ class Critics(nn.Module):
 
 @struct.dataclass
 class ActorPolicy:
-    """What a baseline learned, without chance; it remembers nothing."""
+    """The deterministic policy that a baseline learned. It has no memory."""
 
     params: Any
     action_size: int = struct.field(pytree_node=False)
@@ -93,12 +93,12 @@ class ActorPolicy:
     frame: str = struct.field(pytree_node=False, default="world")
 
     def init(self, state: State) -> tuple[()]:
-        """The memory of N episodes: none."""
+        """The memory of N episodes: it is empty."""
         del state
         return ()
 
     def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
-        """The next actions in N environments with maps."""
+        """The next actions in N environments with maps, and the empty memory."""
         del key
         obs: dict = state.obs  # pyright: ignore
         actor = Actor(self.action_size, self.width, self.frame)

@@ -1,8 +1,8 @@
-"""SAC alone: the controller's learner with the whole maze as its task, without planner or data (paper, sec. IV-B).
+"""SAC alone: the controller's learner with the whole maze as its task, without planner or data (paper, sec. IV-A).
 
-It sees what the transformer sees, its starts and goals lie anywhere in the maze, its reward is minus the distance to
-the goal, and an episode lasts as long as the robot's. The replay keeps positions; the maps are recomputed from them,
-exactly, when a batch is drawn.
+It has the transformer's observations. Starts and goals are anywhere in the maze, the reward is minus the distance to
+the goal, and an episode has the robot's full horizon. The replay buffer keeps positions; local maps are recomputed from
+them, exactly, when a batch is drawn.
 """
 
 from collections.abc import Callable
@@ -22,12 +22,12 @@ from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.controllers.sac import Sac, SacConfig
 
-# Settings of ``SacConfig`` that mean something to a controller on edges only, and what they must be here.
+# Settings of ``SacConfig`` that apply only to training on edges, and the values that they must have here.
 EDGES_ONLY: dict[str, Any] = {"chain": False, "through": False, "turn_ramp": None, "mirror": False, "relabel": 0.0}
 
 
 class SacAlone(Sac):
-    """The learner: ``Sac``, which also sees the local map. ``hidden[0]`` is the width of its networks."""
+    """The learner: ``Sac`` with local maps. ``hidden[0]`` is the width of its networks."""
 
     kept = 4
 
@@ -35,7 +35,7 @@ class SacAlone(Sac):
         set_to = {name: value for name, value in EDGES_ONLY.items() if getattr(config, name) != value}
         if set_to:
             mend = ", ".join(f"{name}={value}" for name, value in set_to.items())
-            raise UserError(f"SAC alone learns from its own steps and from fresh starts: set {mend}")
+            raise UserError(f"SAC alone has no edges, so some settings of SacConfig do not apply; set {mend}")
         super().__init__(env, config)
         self.reward = "distance"
 
@@ -62,7 +62,7 @@ class SacAlone(Sac):
         return Seen(see(position, position + goal), proprio, goal)
 
     def _watch(self, normalizer: Any, inputs: Seen) -> Any:
-        return normalizer  # not asked for: these networks take their inputs as the transformer does
+        return normalizer  # not used: these networks scale their inputs themselves, as the transformer does
 
 
 def train_sac_alone(
@@ -75,12 +75,12 @@ def train_sac_alone(
     checkpoints: Checkpoints | None = None,
     chunk: int = 25,
 ) -> ActorPolicy:
-    """Learn to find goals anywhere in a maze; ``config.episode_steps`` and ``held_out`` mean nothing here.
+    """Learn to reach goals anywhere in a maze; ``config.episode_steps`` and ``held_out`` are not used.
 
     Args:
         env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
-        on_progress: told (iterations done, metrics) after every ``chunk`` iterations.
-        checkpoints: where to go on from, and where to save now and then and when interrupted.
+        on_progress: called with (iterations done, metrics) after every ``chunk`` iterations.
+        checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
     env = env_factory(maps=False)
     sac = SacAlone(env, config)

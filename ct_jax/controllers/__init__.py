@@ -1,1 +1,1 @@
-"""Low-level controllers pi_c: they walk a short way towards a goal and know nothing of walls."""
+"""Low-level controllers pi_c: they walk a short way towards a goal and do not see walls."""

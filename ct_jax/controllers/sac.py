@@ -37,7 +37,7 @@ Metres = Annotated[float, Within(0, 1_000_000)]  # and other prices of a step
 
 @dataclass(frozen=True)
 class SacConfig(Checked):
-    """Soft Actor-Critic (paper, sec. III-F, where it says; otherwise the usual values)."""
+    """Soft Actor-Critic (paper, sec. III-G, where it says; otherwise the usual values)."""
 
     envs: Annotated[int, Within(1, 100_000)] = 64  # environments stepped together
     iterations: Count = 500  # each: one step of all environments, then the updates
@@ -374,7 +374,7 @@ class Sac:
         }  # fmt: skip
 
     def _reward(self, before: State, action: jax.Array, after: State) -> jax.Array:
-        """Dense reward towards the goal (paper, sec. III-F): progress [m/s] or minus the distance [m]; bonuses.
+        """Dense reward towards the goal (paper, sec. III-G): progress [m/s] or minus the distance [m]; bonuses.
 
         Of a fall without an alive bonus it is minus the distance, whatever the robot's reward: see ``_pay_falls``. What
         breaks off otherwise counts as a fall, here and there.

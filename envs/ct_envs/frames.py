@@ -1,8 +1,8 @@
 """A robot's own frame, and the symmetries of its body.
 
-A world may be rotated and reflected by the symmetries of the square without its maps changing but for the order of
-their cells. What becomes of a robot's proprioception and action is a signed permutation; a body that looks the same
-from several sides has further ones, that leave the world as it is.
+A world may be rotated and reflected by the symmetries of the square: this only permutes the cells of its local maps. It
+transforms a robot's proprioception and action by matrices, most of them signed permutations. A body with symmetries of
+its own has more of them, which leave the world unchanged.
 """
 
 import functools
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ct_envs.errors import UserError
 from ct_envs.robots import Robot
 
-FrameName = Literal["world", "heading"]  # whose frame: the world's, or the robot's own
+FrameName = Literal["world", "heading"]  # frame of vectors: the world's, or the robot's own
 
 
 class Symmetries(NamedTuple):
@@ -29,7 +29,7 @@ class Symmetries(NamedTuple):
 
 
 def transform(matrices: Float[Array, "B i j"], vectors: Float[Array, "B *s j"]) -> Float[Array, "B *s i"]:
-    """Each row's vectors by that row's matrix."""
+    """Multiply the vectors of each row by the matrix of that row."""
     return jnp.einsum("bij,b...j->b...i", matrices, vectors)
 
 
@@ -39,22 +39,22 @@ _SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 
 @functools.cache
 def symmetries(robot: Robot) -> Symmetries:
-    """The robot's symmetries in the square's. Raises UserError if none are known."""
+    """The robot's symmetries that match those of the square. Raises UserError if none are known."""
     if robot.name not in _GENERATORS:
         raise UserError(f"robot '{robot.name}' has no known symmetries; train it with mirror=False")
     generators = _GENERATORS[robot.name]()
     found = [tuple(np.eye(len(matrix)) for matrix in generators[0])]
-    for element in found:  # grows while it is read
+    for element in found:  # ``found`` grows during the loop
         for generator in generators:
             new = tuple(g @ e for g, e in zip(generator, element, strict=True))
-            # Proprioception is left out of the comparison: a quaternion and its negative are one attitude.
+            # Proprioception is not compared: a quaternion and its negative are the same attitude.
             if not any(np.allclose(new[0], old[0]) and np.allclose(new[2], old[2]) for old in found):
                 found.append(new)
     return Symmetries(*(np.stack(matrices).astype(np.float32) for matrices in zip(*found, strict=True)))
 
 
 def turns(found: Symmetries) -> Symmetries:
-    """Of the symmetries those that turn the world with the robot in it, and do nothing to its joints."""
+    """The symmetries that rotate the world with the robot in it and do not change its joints."""
     plain = (np.linalg.det(found.world) > 0) & np.isclose(found.action, np.eye(found.action.shape[-1])).all((1, 2))
     return Symmetries(*(matrices[plain] for matrices in found))
 
@@ -65,7 +65,7 @@ def _point() -> list[tuple[np.ndarray, ...]]:
 
 def _ant() -> list[tuple[np.ndarray, ...]]:
     """Two reflections of world and body together, and a quarter turn of the body in an unchanged world."""
-    # new leg i is old leg source[i], its hip and ankle with these signs; see assets/ant.xml for the joints' axes
+    # New leg i is old leg source[i]; its hip and ankle have these signs. See assets/ant.xml for the axes of the joints.
     flip_x = _ant_element(_FLIP_X, -1, [1, 0, 3, 2], -1, [-1, -1, -1, -1], quat=np.diag([1.0, 1.0, -1.0, -1.0]))
     swap = _ant_element(_SWAP, -1, [0, 3, 2, 1], -1, [1, -1, 1, -1], quat=_signed([0, 2, 1, 3], [1, -1, -1, -1]))
     half = np.sqrt(0.5)  # right-multiplication by a quarter turn about z
@@ -85,14 +85,14 @@ def _ant_element(
 
 
 def _element(world: np.ndarray, quat: np.ndarray, angular: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of a free torso: velocity is a vector of the world, angular velocity an axial vector of the body."""
+    """For a free torso: velocity is a vector in the world, angular velocity an axial vector in the body."""
     return world, _blocks(np.eye(1), quat, joints, _blocks(world, np.eye(1)), angular, joints), joints
 
 
 def _humanoid() -> list[tuple[np.ndarray, ...]]:
-    """Left and right change places, and the world may turn by quarters with the robot in it."""
-    # new joint i is old joint order[i] with this sign: abdomen z, y, x; right leg x, z, y, knee; left leg; right arm
-    # (two of the shoulder, elbow); left arm. See assets/humanoid.xml for the axes.
+    """A reflection that swaps left and right, and a quarter turn of the world with the robot in it."""
+    # New joint i is old joint order[i] with this sign: abdomen z, y, x; right leg x, z, y, knee; left leg; right arm
+    # (two shoulder joints, elbow); left arm. See assets/humanoid.xml for the axes.
     order = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6, 14, 15, 16, 11, 12, 13]
     joints = _signed(order, [-1, 1, -1] + [1] * 8 + [-1, -1, 1] * 2)
     flip_y = _element(-_FLIP_X, np.diag([1.0, -1.0, 1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), joints)
@@ -115,7 +115,7 @@ def _blocks(*blocks: np.ndarray) -> np.ndarray:
 
 
 def _turtlebot3() -> list[tuple[np.ndarray, ...]]:
-    """Left and right change places: of the goal's direction (cos, sin) and of the action (v, omega)."""
+    """A reflection that swaps left and right, for the goal's direction (cos, sin) and the action (v, omega)."""
     flip_y = np.diag([1.0, -1.0])
     return [(flip_y, flip_y, flip_y)]
 
@@ -124,10 +124,10 @@ _GENERATORS = {"point": _point, "ant": _ant, "humanoid": _humanoid, "turtlebot3"
 
 
 def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:
-    """The heading (a unit vector of the plane) of a robot with a free torso, and what it feels relative to it.
+    """The heading (a unit vector in the plane) of a robot with a free torso, and its proprioception relative to that.
 
-    The second is height, the world's up in the torso's frame, joints, velocity with x along the heading, angular
-    velocity and joint velocities. It does not change when the world is turned.
+    The second is height, the world's up in the torso's frame, joint angles, velocity with x along the heading, angular
+    velocity and joint velocities. It does not change when the world is rotated.
     """
     joints = (proprio.shape[-1] - 11) // 2
     height, quat, angles, velocity, rest = jnp.split(proprio, np.cumsum([1, 4, joints, 3]).tolist(), -1)
@@ -140,7 +140,7 @@ def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Floa
 
 
 def turn(heading: Float[Array, "*b 2"], vector: Float[Array, "*b 2"]) -> jax.Array:
-    """A vector of the world as one along and across the heading."""
+    """A vector in the world, as components along and across the heading."""
     cosine, sine = heading[..., 0], heading[..., 1]
     along = cosine * vector[..., 0] + sine * vector[..., 1]
     return jnp.stack([along, cosine * vector[..., 1] - sine * vector[..., 0]], -1)

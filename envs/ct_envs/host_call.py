@@ -1,9 +1,9 @@
-"""Python functions that compiled programs call on the CPU by name, so that the programs may outlive the process.
+"""Python functions that compiled programs call on the CPU by name. Such programs can be cached for other processes.
 
-JAX keeps no program with a ``pure_callback`` in its persistent cache, and nearly every program here steps MuJoCo. XLA's
-foreign function interface finds a function by its name, and hands over its own buffers: a call costs a quarter.
+JAX does not cache programs with a ``pure_callback`` on disk, and nearly every program here steps MuJoCo. XLA's foreign
+function interface finds a function by its name and passes its own buffers: a call takes a quarter of the time.
 
-The structures are those of ``xla/ffi/api/c_api.h`` (``jax.ffi.include_dir()``) up to the last field that is used.
+The structures are those of ``xla/ffi/api/c_api.h`` (``jax.ffi.include_dir()``), up to the last field that is used.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ from ctypes import POINTER, c_char_p, c_int, c_int64, c_size_t, c_uint32, c_void
 import jax
 import numpy as np
 
-_VERSION = (0, 1)  # of the interface: what this file needs has been there since
+_VERSION = (0, 1)  # of the interface: the first version with everything that this file needs
 _INTERNAL = 13  # error code
 _DTYPES = {11: np.dtype(np.float32), 12: np.dtype(np.float64)}
 
@@ -67,12 +67,12 @@ _registered: dict[str, object] = {}  # by name; XLA holds no reference to a hand
 
 
 def register(name: str, function: Callable[[np.ndarray, np.ndarray], None]) -> None:
-    """Make a function known, once, for ``jax.ffi.ffi_call(name, ...)`` with one argument and one result.
+    """Register a function for ``jax.ffi.ffi_call(name, ...)`` with one argument and one result. Later calls do nothing.
 
     Args:
-        name: part of every program that calls it; the same name must mean the same function in the next process.
-        function: reads its first array and fills its second; both are XLA's own, and must not be kept. It must not use
-            JAX.
+        name: stored in every program that calls it; it must name the same function in every process.
+        function: reads its first array and fills its second. Both are XLA's buffers: do not keep them. The function
+            must not use JAX.
     """
     if name in _registered:
         return
@@ -80,13 +80,13 @@ def register(name: str, function: Callable[[np.ndarray, np.ndarray], None]) -> N
     @_Handler
     def handle(pointer):
         frame = pointer.contents
-        if frame.extension:  # at first, XLA asks what the handler is
+        if frame.extension:  # the first call only asks for the handler's version
             version = frame.extension.contents.metadata.contents.version
             version.major, version.minor = _VERSION
             return None
         try:
             function(_array(frame.arguments.items[0]), _array(frame.results.items[0]))
-        except BaseException as error:  # nothing may be raised into XLA
+        except BaseException as error:  # no exception may reach XLA
             text = f"{type(error).__name__}: {error}".encode()
             return frame.api.contents.fail(_Failure(ctypes.sizeof(_Failure), None, text, _INTERNAL))
 

@@ -1,6 +1,6 @@
-"""The local occupancy map of a lidar (paper, sec. IV-D). NumPy only: simulations' processes start without jax.
+"""The local occupancy map of a lidar (paper, sec. IV-B). NumPy only: the simulation processes start without JAX.
 
-Its cells are those of ``ct_envs.occupancy``, where the map of a maze is drawn.
+The layout of the map is that of ``ct_envs.occupancy``, which draws the maps of mazes.
 """
 
 from typing import Any
@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from ct_envs.errors import UserError
 
 MAP_CELLS = 25  # k of the paper
-LIDAR_BEAMS = 360  # of the Turtlebot3's LDS-01: one a degree, counter-clockwise from the heading
-LIDAR_RANGE_M = 1.0  # what we use of its 3.5 m (paper, sec. IV-D)
-LIDAR_CELL_M = 0.08  # so that the window just holds the range
+LIDAR_BEAMS = 360  # of the Turtlebot3's LDS-01: one for each degree, counter-clockwise from the heading
+LIDAR_RANGE_M = 1.0  # the range that we use; the lidar has 3.5 m (paper, sec. IV-B)
+LIDAR_CELL_M = 0.08  # 25 cells just cover the range on both sides
 
 
 def lidar_map(
@@ -27,17 +27,17 @@ def lidar_map(
     beams: int = LIDAR_BEAMS,
     missing_ok: bool = False,
 ) -> UInt8[np.ndarray, "*b 2 k k"]:
-    """The local map of a lidar: channel 0 is 1 in the cells in which beams end, channel 1 in the goal's (sec. IV-D).
+    """The local map of a lidar: channel 0 is 1 in cells where a beam ends, channel 1 in the goal's cell (sec. IV-B).
 
     Args:
-        ranges: [*b, beams] (m); beam i is ``360 i / beams`` degrees to the left of the heading. One of ``range_m`` or
-            more met nothing that counts.
+        ranges: [*b, beams] (m); beam i points ``360 i / beams`` degrees to the left of the heading. Ranges of
+            ``range_m`` or more are not drawn.
         goal: vector from the robot to the goal [*b, 2] (m), in the frame of the map.
-        yaw_rad: of the robot in the frame of the map [*b]; 0 for a map in the robot's own frame (x ahead, y left).
-        missing_ok: whether NaN, infinity and 0, with which lidars report that nothing came back, are taken as such.
+        yaw_rad: yaw of the robot in the frame of the map [*b]; 0 for a map in the robot's own frame (x ahead, y left).
+        missing_ok: accept NaN, infinity and 0, by which lidars report that a beam did not come back.
 
     Raises:
-        UserError: too few or too many ranges, negative ones or, without ``missing_ok``, missing ones.
+        UserError: the number of ranges is wrong, a range is negative or, without ``missing_ok``, a range is missing.
     """
     ranges, goal = np.asarray(ranges, np.float64), np.asarray(goal, np.float64)
     if ranges.shape[-1:] != (beams,):
@@ -58,7 +58,7 @@ def lidar_map(
 
 
 def _mark(channel: np.ndarray, points: np.ndarray, meant: Any, cell_m: float) -> None:
-    """Set the cells [*b, k, k] that hold the points [*b, n, 2] (m) that are meant and inside the window."""
+    """Set the cells [*b, k, k] of the points [*b, n, 2] (m) that are flagged in ``meant`` and inside the window."""
     cells = channel.shape[-1]
     at = np.floor(points / cell_m + cells / 2)
     *batch, _ = held = np.nonzero(((at >= 0) & (at < cells)).all(-1) & meant)

@@ -114,7 +114,7 @@ jax.tree_util.register_dataclass(MazeState, [*State.__dataclass_fields__], [])
 
 
 class MazeEnv(Env):
-    """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-F).
+    """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-G).
 
     Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
     velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.

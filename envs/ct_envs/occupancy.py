@@ -1,10 +1,10 @@
-"""The 2 x k x k local occupancy map, the only thing a policy sees of the walls (paper, sec. IV-A and IV-D).
+"""The 2 x k x k local occupancy map: the only view of the walls that a policy has (paper, sec. IV-A and IV-B).
 
-The window is centred on the robot and aligned with the world. ``map[channel, i, j]`` is the point
-``(j - (k - 1) / 2, i - (k - 1) / 2) * cell_m`` from the robot, so ``i`` runs up (y) and ``j`` right (x). Channel 0 is
-1 where that point is in a wall; channel 1 is 1 in the one cell that holds the goal, if the window holds it.
+The window is centred on the robot and aligned with the world. ``map[channel, i, j]`` describes the point
+``(j - (k - 1) / 2, i - (k - 1) / 2) * cell_m`` from the robot: ``i`` increases upwards (y), ``j`` to the right (x).
+Channel 0 is 1 if that point is in a wall. Channel 1 is 1 in the cell of the goal, if the goal is inside the window.
 
-From a maze, under jit, ``local_map`` draws it; from the ranges of a lidar, in NumPy, ``lidar_map``.
+``local_map`` draws the map of a maze, under jit. ``lidar_map`` draws it from the ranges of a lidar, in NumPy.
 """
 
 import jax.numpy as jnp
@@ -26,12 +26,12 @@ def local_map(
 ) -> UInt8[Array, "2 k k"]:
     """The local map at ``position`` [m] with a goal at ``goal`` [m]; ``cell_m`` is the side of a map cell [m].
 
-    In bytes: thousands of maps a step are a matter of memory bandwidth.
+    Its entries are bytes: memory bandwidth limits the speed of thousands of maps a step.
     """
     offset = (jnp.arange(cells) - (cells - 1) / 2) * cell_m
     column, row = (jnp.floor((position[:, None] + offset[None]) / maze.cell_m)).astype(jnp.int32)
     height, width = maze.shape
-    # Padding and border are wall, so a point outside the array may read the nearest cell inside it.
+    # Padding and border are wall, so a point outside the array can use the nearest cell inside.
     walls = maze.walls[jnp.clip(row, 0, height - 1)[:, None], jnp.clip(column, 0, width - 1)[None, :]]
     at = jnp.round((goal - position) / cell_m + (cells - 1) / 2).astype(jnp.int32)
     index = jnp.arange(cells)

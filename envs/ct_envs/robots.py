@@ -25,7 +25,7 @@ class Robot:
     reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
     upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
     height_min_m: float | None = None  # height of the torso below which the robot has fallen
-    controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-F)
+    controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
     has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
     course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
 

@@ -1,4 +1,4 @@
-"""The Turtlebot3 burger in a cluttered room: one PyBullet simulation, on the CPU (paper, sec. IV-D).
+"""The Turtlebot3 burger in a cluttered room: one PyBullet simulation, on the CPU (paper, sec. IV-B).
 
 What a policy sees is what the robot itself can give it, in the robot's own frame (x ahead, y to the left): the
 direction of the goal [cos dpsi, sin dpsi], where dpsi is the angle from the heading to the goal; the vector to the goal
@@ -100,7 +100,7 @@ class Step(NamedTuple):
 
 
 def wheel_speeds(v_mps: Any, omega_radps: Any) -> Any:
-    """Speeds of the left and the right wheel [..., 2] (rad/s) at linear speed v and turning speed omega (sec. IV-D)."""
+    """Speeds of the left and the right wheel [..., 2] (rad/s) at linear speed v and turning speed omega (sec. IV-B)."""
     v_mps, omega_radps = np.asarray(v_mps, np.float64), np.asarray(omega_radps, np.float64)
     left = (v_mps - omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M
     right = (v_mps + omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M

@@ -1,4 +1,4 @@
-"""Cluttered rooms for the Turtlebot3: a square of walls with boxes and cylinders in it (paper, sec. IV-D). NumPy only.
+"""Cluttered rooms for the Turtlebot3: a square of walls with boxes and cylinders in it (paper, sec. IV-B). NumPy only.
 
 Coordinates are SI: x right, y up, the room's lower-left corner at (0, 0). The paper says neither how large its rooms
 are nor how full; ours are 5 m x 5 m, and 5 to 10 % of the floor is covered in training.
