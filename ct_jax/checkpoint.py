@@ -18,11 +18,13 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from ct_envs import UserError
 from ct_jax import devices
+from ct_jax.files import check_folders, make_folder, whole, write_text
 from ct_jax.interrupts import rescued_by, uninterrupted
+from ct_jax.terminal import printable
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
@@ -46,7 +48,7 @@ def _write_manifest(folder: Path) -> None:
     """Write the sums of all files in a folder, beside them."""
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     lines = [f"{_sum(file)}  {file.relative_to(folder).as_posix()}\n" for file in files]
-    (folder / MANIFEST).write_text("".join(lines), "utf-8")
+    write_text(folder / MANIFEST, "".join(lines))
 
 
 def _check_manifest(folder: Path) -> None:
@@ -88,7 +90,11 @@ class Checkpoints:
         Args:
             keep: how many states stay on disk.
             every_s: ``maybe_save`` saves when the last save is older than this [s]; by default ``SAVE_EVERY_S``.
+
+        Raises:
+            UserError: the folder, or one in it, is a link, or it cannot be made.
         """
+        devices.first(lambda: _make_folder(folder))
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=_Handler())
@@ -150,9 +156,14 @@ class Checkpoints:
         self._manager.close()
 
 
+def _make_folder(folder: Path) -> None:
+    make_folder(folder, parents=True)
+    check_folders(folder)
+
+
 def _put_aside(folder: Path, bad: Exception) -> None:
     reason = " ".join(str(bad).split())[:200]
-    print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
+    print(printable(f"warning: {folder}: damaged checkpoint, going on without it ({reason})"), file=sys.stderr)
     with suppress(FileNotFoundError):  # another process of the same training was quicker
         folder.rename(folder.with_name(f"damaged-{folder.name}-{time.time_ns()}"))
 
@@ -213,15 +224,9 @@ def save_weights(file: Path, tree: Any) -> None:
     """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     arrays = {_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}
-    part = file.with_name(file.name + ".part")
-    try:
-        save_file(arrays, part, metadata={"sha256": _sum_of_arrays(arrays)})
-    except SafetensorError as bad:
-        part.unlink(missing_ok=True)
-        raise UserError(
-            f"{file}: cannot be written ({_text(bad)}); free some space and continue with --resume"
-        ) from None
-    part.replace(file)
+    content = save(arrays, metadata={"sha256": _sum_of_arrays(arrays)})  # its own files only their owner may read
+    with whole(file) as opened:
+        opened.write(content)
 
 
 def _sum_of_arrays(arrays: dict[str, np.ndarray]) -> str:
@@ -261,10 +266,8 @@ def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write JSON so that a reader never sees half of it."""
-    part = file.with_name(file.name + ".part")
-    part.write_text(json.dumps(value, indent=2) + "\n", "utf-8")
-    part.replace(file)
+    """Write JSON so that a reader never sees half of it. Raises UserError."""
+    write_text(file, json.dumps(value, indent=2) + "\n")
 
 
 def read_json(file: Path, *, mend: str = "delete it and run again") -> dict[str, Any]:

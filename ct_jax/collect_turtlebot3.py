@@ -19,6 +19,7 @@ from ct_jax.collect import CollectConfig, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, GuidedDriver, drive, to_trajectories
 from ct_jax.explorer_turtlebot3 import ExplorerGuide
+from ct_jax.files import make_folder
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
@@ -278,7 +279,7 @@ def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Call
     Args:
         mend: what the error tells a person to do about a damaged file.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
 
     def keep(wave: Callable[[int], Any]) -> Callable[[int], Any]:
         def read_or_drive(first: int) -> Any:
@@ -286,9 +287,7 @@ def keeping(folder: Path, *, mend: str) -> Callable[[Callable[[int], Any]], Call
             if not file.is_file():
                 data, *flags = wave(first)
                 write_json(flags_file, {"flags": [flag.tolist() for flag in flags]})
-                part = folder / "part.npz"
-                save(data, part)
-                part.replace(file)  # last: it says that all is there
+                save(data, file)  # last: it says that all is there
             try:
                 return load(file), *(np.array(flag, bool) for flag in read_json(flags_file, mend=mend)["flags"])
             except UserError as bad:

@@ -17,6 +17,7 @@ from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
+from ct_jax.files import make_folder, whole
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
@@ -38,7 +39,7 @@ class TrainedModel:
 
 def save_model(folder: Path, model: TrainedModel) -> None:
     """Write a model into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
     (folder / "model.json").unlink(missing_ok=True)  # written last: it says that the weights are whole
     save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller))
     write_json(
@@ -99,7 +100,7 @@ def load_model(run: str) -> TrainedModel:
 
 def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
     """Write a controller into a folder: ``weights.safetensors``, and last ``controller.json``."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
     save_weights(folder / "weights.safetensors", controller)
     write_json(folder / "controller.json", _sizes(robot) | {"format": 1, "sac": asdict(config), "made": made})
 
@@ -135,7 +136,8 @@ def copy_controller(where: str, robot: str, folder: Path) -> None:
     """Copy a controller's files into a folder that exists, if ``load_controller`` takes it. Raises UserError, as it."""
     load_controller(where, robot)
     for name in ("weights.safetensors", "controller.json"):
-        (folder / name).write_bytes((_controller_folder(where, robot) / name).read_bytes())
+        with whole(folder / name) as opened:
+            opened.write((_controller_folder(where, robot) / name).read_bytes())
 
 
 def _controller_folder(where: str, robot: str) -> Path:

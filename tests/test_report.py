@@ -15,6 +15,7 @@ from ct_envs import UserError
 from ct_envs.maze import draw_walls, load_walls
 from ct_jax.report import draw_maze, draw_paths, pictures, reading, words, write_report
 from ct_jax.report.page import page as to_html
+from ct_jax.terminal import printable
 
 SEEN, UNSEEN = "antmaze-umaze", "antmaze-medium"
 METHODS = ("ct", "planner", "explorer", "some-other")
@@ -343,11 +344,20 @@ def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
 
 @pytest.mark.parametrize(
     "name",
-    ['<script>alert("x")</script>', "a'b\"c&d", "$\\frac{1}{$", "../../etc/maze", "迷路 🤖", "\ud800", "x" * 200],
+    [
+        '<script>alert("x")</script>',
+        "a'b\"c&d",
+        "$\\frac{1}{$",
+        "../../etc/maze",
+        "迷路 🤖",
+        "\ud800",
+        "\x1b[31m",
+        "x" * 200,
+    ],
 )
 def test_a_name_is_only_ever_text(make_run, name):
     text, page = read(make_run(unseen=name))
-    shown = name.encode("utf-8", "replace").decode()
+    shown = printable(name)
     assert not any(tag == "script" for tag, _ in page.tags)
     assert shown in page.text
     assert escape(shown) in text
