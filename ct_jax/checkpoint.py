@@ -19,12 +19,14 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from ct_envs import UserError
 from ct_envs.checked import shown
 from ct_jax import devices
+from ct_jax.files import check_folders, make_folder, whole, write_text
 from ct_jax.interrupts import rescued_by, uninterrupted
+from ct_jax.terminal import printable
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
@@ -48,7 +50,7 @@ def _disk_error(error: ValueError) -> str:
 def _write_manifest(folder: Path) -> None:
     """Write the sums of all files in a folder, beside them."""
     lines = [f"{_sum(file)}  {name}\n" for name, file in _files(folder)]
-    (folder / MANIFEST).write_text("".join(lines), "utf-8")
+    write_text(folder / MANIFEST, "".join(lines))
 
 
 def _check_manifest(folder: Path) -> None:
@@ -99,7 +101,11 @@ class Checkpoints:
         Args:
             keep: how many states stay on disk.
             every_s: ``maybe_save`` saves when the last save is older than this [s]; by default ``SAVE_EVERY_S``.
+
+        Raises:
+            UserError: the folder, or one in it, is a link, or it cannot be made.
         """
+        devices.first(lambda: _make_folder(folder))
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=_Handler())
@@ -161,9 +167,14 @@ class Checkpoints:
         self._manager.close()
 
 
+def _make_folder(folder: Path) -> None:
+    make_folder(folder, parents=True)
+    check_folders(folder)
+
+
 def _put_aside(folder: Path, bad: Exception) -> None:
     reason = " ".join(str(bad).split())[:200]
-    print(f"warning: {folder}: damaged checkpoint, going on without it ({reason})", file=sys.stderr)
+    print(printable(f"warning: {folder}: damaged checkpoint, going on without it ({reason})"), file=sys.stderr)
     with suppress(FileNotFoundError):  # another process of the same training was quicker
         folder.rename(folder.with_name(f"damaged-{folder.name}-{time.time_ns()}"))
 
@@ -231,17 +242,11 @@ def save_weights(file: Path, tree: Any, *, of: Any = None) -> None:
     for name, array in arrays.items():
         if not _is_finite(array):
             raise UserError(f"{file}: '{name}' has become infinite or NaN in training; try a lower learning rate")
-    part = file.with_name(file.name + ".part")
     # One entry, for safetensors writes several in any order, and the same weights are to be the same file.
     sums = [_sum_of_arrays(arrays)] + ([] if of is None else [_digest(of)])
-    try:
-        save_file(arrays, part, metadata={"sha256": " ".join(sums)})
-    except SafetensorError as bad:
-        part.unlink(missing_ok=True)
-        raise UserError(
-            f"{file}: cannot be written ({_text(bad)}); free some space and continue with --resume"
-        ) from None
-    part.replace(file)
+    content = save(arrays, metadata={"sha256": " ".join(sums)})  # its own files only their owner may read
+    with whole(file) as opened:
+        opened.write(content)
 
 
 def _sum_of_arrays(arrays: dict[str, np.ndarray]) -> str:
@@ -322,14 +327,12 @@ def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, men
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write JSON so that a reader never sees half of it. Raises UserError for numbers that JSON has not."""
-    part = file.with_name(file.name + ".part")
+    """Write JSON so that a reader never sees half of it. Raises UserError, also for numbers that JSON has not."""
     try:
         text = json.dumps(value, indent=2, allow_nan=False)
     except ValueError:
         raise UserError(f"{file}: cannot be written (a number is infinite or NaN)") from None
-    part.write_text(text + "\n", "utf-8")
-    part.replace(file)
+    write_text(file, text + "\n")
 
 
 def read_json(file: Path, *, mend: str = "delete it and run again") -> dict[str, Any]:

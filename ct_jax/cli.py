@@ -30,6 +30,7 @@ from tyro.conf import (
 from ct_envs.errors import UserError
 from ct_jax import __version__
 from ct_jax.interrupts import Terminated, interruptible
+from ct_jax.terminal import check_stdout, one_line, printable, show_anything
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,7 +60,8 @@ class Processes:
     cluster: FlagCreatePairsOff[bool] = False
     """This is one of several processes; JAX finds the others (Slurm, Open MPI, Kubernetes, Cloud TPU)."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: none)")] = None
-    """This is one of several processes; the address of the first, with any port that is free there."""
+    """This is one of several processes; the address of the first, which listens there and nowhere else, with any port
+    that is free there. Whoever reaches the port can join and disturb the training: keep it to hosts that you trust."""
     processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(with --coordinator)")] = None
     """How many there are."""
     process: Annotated[int | None, arg(metavar="I", help_behavior_hint="(with --coordinator)")] = None
@@ -103,7 +105,7 @@ class Train:
     """Low-level controller: learn one's own (by default; walkers' demos take zoo), take the one that ships with the
     package, or that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
-    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
+    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in the folder: finished stages are skipped."""
     among: Annotated[Processes, arg(name="")] = Processes()
@@ -150,7 +152,7 @@ class Evaluate:
     """The transformer asks for K times the return that the value network predicts; returns are negative, so less than 1
     asks to be quicker."""
     engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
-    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators."""
+    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
     picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Draw all episodes in the maze: a .png, .svg or .pdf file."""
     video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
@@ -183,9 +185,6 @@ COMMANDS = {"train": Train, "evaluate": Evaluate, "report": Report, "mazes": Maz
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ["--version"]:
-        print(f"{PROGRAM} {__version__}")
-        return 0
     return guarded(lambda: _run(arguments), go_on=_how_to_go_on(arguments))
 
 
@@ -195,24 +194,36 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
     Args:
         go_on: what a person whose Ctrl-C stopped it should know.
     """
+    show_anything()
+    go_on = printable(go_on)
     try:
         with interruptible(f"stopped; {go_on}"):
             action()
             sys.stdout.flush()
         return 0
     except UserError as bad:
-        return _fail(str(bad))
+        return _fail(bad)
     except BrokenPipeError:  # whoever read our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_stdout()
         return 0
     except OSError as bad:  # a full disk, no permission, ...
+        _close_stdout()
         where = f"{bad.filename}: " if bad.filename else ""
         return _fail(f"{where}{bad.strerror or bad}; make room or choose another place, what is finished is kept")
     except KeyboardInterrupt as stop:
         global _stopped
         _stopped = True
-        print(f"stopped; {go_on}", file=sys.stderr)
+        _say(f"stopped; {go_on}")
         return 0 if isinstance(stop, Terminated) else INTERRUPTED
+
+
+def _close_stdout() -> None:
+    """Give up on what stdout still holds, if it cannot be written: else Python would try again at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.stdout.flush()
 
 
 def leave(status: int) -> NoReturn:
@@ -232,15 +243,23 @@ def entry() -> NoReturn:
 
 
 def _run(arguments: list[str]) -> None:
+    if arguments[:1] == ["--version"]:
+        print(f"{PROGRAM} {__version__}")
+        return
     command = _parse([argument for argument in arguments if argument != ALL_SETTINGS])
     if ALL_SETTINGS in arguments:
         return _print_settings(command)
     {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes}[type(command)](command)
 
 
-def _fail(reason: str) -> int:
-    print(f"error: {' '.join(reason.split())}", file=sys.stderr)
+def _fail(reason: Any) -> int:
+    _say(f"error: {one_line(reason)}")
     return BAD_INPUT
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # nobody can be told that stderr cannot be written
+        print(text, file=sys.stderr, flush=True)
 
 
 def _how_to_go_on(arguments: list[str]) -> str:
@@ -262,33 +281,38 @@ def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
 
     commands = [Annotated[kind, subcommand(name, description=brief(kind))] for name, kind in COMMANDS.items()]
     choice: Any = functools.reduce(operator.or_, commands)
-    program = f"{PROGRAM} {chosen}" if chosen in COMMANDS else PROGRAM
-    with _in_one_line(f"{program} --help"):
+
+    def parse() -> Any:
         if chosen != "train":
             return tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments)
         # What ``Train`` does not know may be a setting of the method, whose default the preset says.
         command, changes = tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments, return_unknown_args=True)
         return replace(command, changes=tuple(changes))
 
+    return _in_one_line(parse, f"{PROGRAM} {chosen} --help" if chosen in COMMANDS else f"{PROGRAM} --help")
 
-@contextlib.contextmanager
-def _in_one_line(see: str) -> Iterator[None]:
-    """Raises UserError with what tyro prints, in one line, and the command to see."""
-    said = io.StringIO()
+
+def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
+    """What tyro parses. Raises UserError with what it prints about mistakes, in one line, and the command to see."""
+    said = io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape")
     try:
-        with contextlib.redirect_stderr(said):
-            yield
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), _unwrapped():
+            return parse()
     except SystemExit as stop:
         if not stop.code:
+            with contextlib.suppress(SystemExit):
+                parse()  # once more, with the help where it belongs
+            sys.stdout.flush()
             raise
-        raise UserError(f"{_reason(said.getvalue())}; see {see}") from None
+        said.seek(0)
+        raise UserError(f"{_reason(said.read())}; see {see}") from None
 
 
 def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
     """The preset's settings with those that were given in their place."""
     from ct_jax.presets import Settings
 
-    with _in_one_line(f"{PROGRAM} train {command.robot} {ALL_SETTINGS}"):
+    def parse() -> Settings:
         return tyro.cli(
             AvoidSubcommands[Settings],
             prog=f"{PROGRAM} train {command.robot} --preset {command.preset}",
@@ -296,6 +320,8 @@ def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
             default=settings,
             args=[*command.changes, *more],
         )
+
+    return _in_one_line(parse, f"{PROGRAM} train {command.robot} {ALL_SETTINGS}")
 
 
 def _print_settings(command: Any) -> None:
@@ -307,6 +333,19 @@ def _print_settings(command: Any) -> None:
 
     with contextlib.suppress(SystemExit):
         _changed(get_preset(command.preset, command.robot), command, "--help")
+
+
+@contextlib.contextmanager
+def _unwrapped() -> Iterator[None]:
+    """Within, nobody breaks lines for the terminal's width."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "10000"
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
 
 
 def _reason(text: str) -> str:
@@ -327,28 +366,34 @@ def _reason(text: str) -> str:
 
 def prepare_jax(among: Processes = Processes()) -> None:
     """One CPU device a core, exact float32 products, compiled programs that are kept, and the other processes."""
+    _import_jax()
     import jax
 
     import ct_envs.quiet  # noqa: F401
     import ct_jax.pipeline  # noqa: F401
+    from ct_jax import devices
     from ct_jax.compilation import keep_programs
     from ct_jax.run import cores
 
+    devices.check_flags()
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs what it also raises, in hundreds of lines
     # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning
     keep_programs()
     if among != Processes():
-        from ct_jax.devices import start
-
-        start(among.coordinator, among.processes, among.process)
-    try:
-        jax.devices()
-    except RuntimeError as bad:
-        raise UserError(f"jax finds no device ({bad}); set JAX_PLATFORMS=cpu or install its plugin") from None
+        devices.start(among.coordinator, among.processes, among.process)
+    devices.start_backend()
     # XLA has a page of doubts about each program that it did not compile itself; what fails is raised besides.
     jax.config.update("jax_logging_level", "CRITICAL")
+
+
+def _import_jax() -> None:
+    """Raises UserError where JAX takes offence at its variables, or does not load."""
+    try:
+        import jax  # noqa: F401
+    except Exception as bad:
+        raise UserError(f"JAX cannot be loaded ({bad}); correct the variable, or install JAX anew") from None
 
 
 def _train(command: Train) -> None:
@@ -357,6 +402,7 @@ def _train(command: Train) -> None:
     if get_robot(command.robot).course == "room":
         _check_in_rooms(command)  # before what takes seconds
     _check_processes(command.among)
+    check_stdout()
     prepare_jax(command.among)
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
@@ -388,7 +434,7 @@ def _train(command: Train) -> None:
     report = pipeline.train(run, resume=command.resume)
     if is_first():
         print_rows(pipeline.results(run.folder))
-        print(f"model:  {run.folder / 'model'}\nreport: {report}")
+        print(f"model:  {printable(run.folder / 'model')}\nreport: {printable(report)}")
 
 
 def _checked_count(mazes: int) -> int:
@@ -411,8 +457,8 @@ def _check_processes(among: Processes) -> None:
         raise UserError("--coordinator HOST:PORT, --processes N and --process I go together; give all three")
     assert among.coordinator is not None and among.processes is not None and among.process is not None
     host, _, port = among.coordinator.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise UserError(f"--coordinator {among.coordinator}: give HOST:PORT, such as 10.0.0.1:1234")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16 or (":" in host and host[0] + host[-1] != "[]"):
+        raise UserError(f"--coordinator {among.coordinator}: give HOST:PORT, such as 10.0.0.1:1234 or [fd00::1]:1234")
     if among.processes < 1:
         raise UserError(f"--processes {among.processes}: give 1 or more")
     if not 0 <= among.process < among.processes:
@@ -433,7 +479,8 @@ def _check_in_rooms(command: Train) -> None:
 
 def _evaluate(command: Evaluate) -> None:
     _check_processes(command.among)
-    with _stdout_to_stderr() if command.json else contextlib.nullcontext():
+    check_stdout()
+    with _stdout_to_stderr() if command.json else _stdout_as_it_is() as to_stdout:
         prepare_jax(command.among)
         from ct_jax import pipeline
         from ct_jax.devices import is_first
@@ -452,33 +499,67 @@ def _evaluate(command: Evaluate) -> None:
             "video",
         )
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
-        row = pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, **given)
-    if not is_first():
-        return
-    if command.json:
-        print(json.dumps(row))
-    else:
-        print_rows([row])
+
+        def keep(row: Row) -> None:
+            if is_first():
+                with to_stdout():
+                    _print_row(row, as_json=command.json)
+
+        pipeline.evaluate_model(command.run, method=command.method, seed=command.seed, keep=keep, **given)
+
+
+def _print_row(row: "Row", *, as_json: bool) -> None:
+    """Print a row at once, or on stderr if stdout cannot be written: it took long to come by."""
+    try:
+        if as_json:
+            print(json.dumps(row))
+        else:
+            print_rows([row])
+        sys.stdout.flush()
+    except BrokenPipeError:  # there may be a picture still to be drawn
+        _close_stdout()
+    except OSError:
+        _say(json.dumps(row))
+        raise
+
+
+ToStdout = Callable[[], contextlib.AbstractContextManager[None]]
 
 
 @contextlib.contextmanager
-def _stdout_to_stderr() -> Iterator[None]:
-    """Whatever libraries print, C code included, goes to stderr."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield
-    finally:
+def _stdout_as_it_is() -> Iterator[ToStdout]:
+    yield contextlib.nullcontext
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr() -> Iterator[ToStdout]:
+    """Whatever libraries print, C code included, goes to stderr, but for what is printed within what this yields."""
+
+    @contextlib.contextmanager
+    def switched(to: int) -> Iterator[None]:
         sys.stdout.flush()
-        os.dup2(kept, 1)
+        before = os.dup(1)
+        os.dup2(to, 1)
+        try:
+            yield
+            sys.stdout.flush()
+        finally:
+            os.dup2(before, 1)
+            os.close(before)
+
+    kept = os.dup(1)
+    try:
+        with switched(2):
+            yield lambda: switched(kept)
+    finally:
         os.close(kept)
 
 
 def _report(command: Report) -> None:
+    _import_jax()
     from ct_jax.report import write_report
 
-    print(write_report(command.run))
+    print(printable(write_report(command.run)))
 
 
 def _console(width: int | None = None) -> "Console":
@@ -488,10 +569,11 @@ def _console(width: int | None = None) -> "Console":
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # for ``guarded``; rich would end the program with status 1
 
-    return Ours(width=width)
+    return Ours(width=width, markup=False, emoji=False, highlight=False)
 
 
 def _mazes(command: Mazes) -> None:
+    _import_jax()
     from rich.columns import Columns
     from rich.panel import Panel
 
@@ -531,12 +613,12 @@ def print_rows(rows: list[Row]) -> None:
     for name in columns:
         table.add_column(name, justify="left" if name in ("maze", "method") else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(show(row) for show in columns.values()))
+        table.add_row(*(printable(show(row)) for show in columns.values()))
     console = _console(width=None if sys.stdout.isatty() else 120)
     console.print(table)
     for row in rows:
         for note in _notes(row):
-            console.print(f"{row['maze']}, {row['method']}: {note}", style="dim", soft_wrap=True)
+            console.print(printable(f"{row['maze']}, {row['method']}: {note}"), style="dim", soft_wrap=True)
 
 
 def _notes(row: Row) -> Iterator[str]:

@@ -20,6 +20,7 @@ from ct_jax.collect import CollectConfig, Guide, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import Drive, GuidedDriver, drive, to_trajectories
 from ct_jax.explorer_turtlebot3 import ExplorerGuide
+from ct_jax.files import make_folder
 from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
@@ -295,7 +296,7 @@ def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int],
         kinds: number of flag arrays that a wave has besides its trajectories.
         mend: the advice in the error about a damaged file.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
 
     def keep(wave: Callable[[int], Any]) -> Callable[[int], Any]:
         def read_or_drive(first: int) -> Any:
@@ -303,9 +304,7 @@ def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int],
             if not file.is_file():
                 data, *flags = wave(first)
                 write_json(flags_file, {"flags": [flag.tolist() for flag in flags]})
-                part = folder / "part.npz"
-                save(data, part)
-                part.replace(file)  # last: this file shows that the wave is complete
+                save(data, file)  # last: this file shows that the wave is complete
             try:
                 data = load(file)
             except UserError as bad:

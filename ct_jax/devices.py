@@ -8,6 +8,11 @@ With one process, all of these functions are the identity.
 """
 
 import json
+import os
+import re
+import socket
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -25,23 +30,76 @@ T = TypeVar("T")
 AXIS = "data"
 
 
+_SAID = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # variables that decide which devices there are
+_PARSE_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
+
+
+def check_flags() -> None:
+    """Raise UserError for XLA_FLAGS with which XLA would end the process; before anything asks JAX for its devices.
+
+    Another process tries them, in a tenth of a second.
+    """
+    if not (flags := os.environ.get("XLA_FLAGS")):
+        return
+    tried = subprocess.run([sys.executable, "-c", _PARSE_FLAGS], capture_output=True, text=True, errors="replace")
+    if tried.returncode and (reasons := re.findall(r"^[EF]\d{4} [^]]*\] (.*)", tried.stderr, re.MULTILINE)):
+        raise UserError(f"XLA_FLAGS='{flags}': {reasons[0].rstrip('.')}; correct or unset that variable")
+
+
+def start_backend() -> None:
+    """Start JAX's devices. Raises UserError where they do not start."""
+    try:
+        jax.devices()
+    except Exception as bad:  # there are many kinds, an assertion without a word among them
+        said = " ".join(f"{name}='{os.environ[name]}'" for name in _SAID if os.environ.get(name))
+        reason = " ".join(str(bad).split())[:300] or "no such platform is installed"
+        mend = (
+            "set JAX_PLATFORMS=cpu and unset XLA_FLAGS, or install the platform's plug-in "
+            "(NVIDIA: pip install 'jax[cuda13]')"
+        )
+        raise UserError(f"JAX finds no device{' with ' * bool(said)}{said} ({reason}); {mend}") from None
+
+
 def start(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Join the other processes; before anything else asks JAX for its devices.
 
+    Process 0 listens at the coordinator's address, and at no other. Whoever reaches that port can join, read, change
+    and stop the training: there is no password and no encryption. See ``docs/security.md``.
+
     Args:
-        coordinator: HOST:PORT of process 0; with None, JAX finds it, and the rest, by its own cluster detection.
+        coordinator: HOST:PORT of process 0; with None, JAX finds it, and the rest, by its own cluster detection, and
+            listens at all addresses unless JAX_COORDINATOR_BIND_ADDRESS names one.
 
     Raises:
-        UserError: no cluster is found, or the other processes are not.
+        UserError: no cluster is found, or the other processes are not, or the address is not one of this machine.
     """
     jax.config.update("jax_enable_preemption_service", False)  # its handler of SIGTERM would take the place of ours
+    listens = None if coordinator is None or process != 0 else listening_address(coordinator)
     try:
-        jax.distributed.initialize(coordinator, processes, process)
+        jax.distributed.initialize(coordinator, processes, process, coordinator_bind_address=listens)
     except (ValueError, RuntimeError) as bad:
         where = f"{coordinator}: process {process} of {processes} cannot join" if coordinator else "no cluster is found"
         mend = "" if coordinator else "; name it with --coordinator HOST:PORT --processes N --process I"
         raise UserError(f"{where} ({' '.join(str(bad).split())[:200]}){mend}") from None
     interrupts.obey_together(largest)
+
+
+def listening_address(coordinator: str) -> str:
+    """HOST:PORT as numbers, IPv6 in brackets, where HOST may be a name.
+
+    Raises:
+        UserError: it is no address of this machine, or somebody listens there already.
+    """
+    host, _, port = coordinator.rpartition(":")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:  # for gRPC would say little of what is wrong
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind(address)
+    except OSError as bad:
+        mend = "give an address of process 0's own machine, and a port that is free there"
+        raise UserError(f"--coordinator {coordinator}: cannot listen there ({bad.strerror or bad}); {mend}") from None
+    return f"[{address[0]}]:{port}" if family == socket.AF_INET6 else f"{address[0]}:{port}"
 
 
 def is_first() -> bool:

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from ct_jax.terminal import one_line
+
 GRACE_S = 4.0  # after SIGTERM, until the thread saves by itself: SIGKILL often comes after ten
 _CALLBACKS = ("ct_envs.host_call", "jax._src.callback")
 
@@ -112,7 +114,7 @@ def _watch(reader: int, over: threading.Event, farewell: str) -> None:
         try:
             save()
         except Exception as error:  # what was saved before is still there
-            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+            print(f"error: {one_line(error)}", file=sys.stderr)
     print(farewell, file=sys.stderr, flush=True)
     os._exit(0)
 

@@ -16,6 +16,7 @@ from ct_jax.checkpoint import read_json, write_json
 from ct_jax.collect import collect
 from ct_jax.controllers.sac import SacConfig, SacController, train_controller
 from ct_jax.evaluate import METHODS, Episodes, Learned, Pairs, check_horizon, draw_pairs, evaluate, horizon_for
+from ct_jax.files import check_writable, save_arrays
 from ct_jax.finetune import recover
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
@@ -103,7 +104,7 @@ def _roadmap(run: Run) -> Roadmap:
     if run.done("prm") is None:
         with run.stage("prm") as (folder, info):
             file = folder / "roadmap.npz"
-            devices.first(lambda: np.savez_compressed(file, points=roadmap.points, edges=roadmap.edges))
+            devices.first(lambda: save_arrays(file, points=roadmap.points, edges=roadmap.edges))
             info |= {"points": len(roadmap.points), "edges": len(roadmap.edges)}
     return roadmap
 
@@ -171,13 +172,22 @@ def _read_pairs(file: Path, found: dict[str, Any], seed: int) -> Pairs:
     return Pairs(start, goal, shortest_m, seed, straight=straight)
 
 
+def _check_picture(file: Path) -> None:
+    """Raises UserError unless a picture can be written to the file."""
+    if file.suffix not in PICTURES:
+        raise UserError(f"--picture {file}: give a {', '.join(PICTURES)} file")
+    devices.first(lambda: check_writable(file, option="--picture"))
+
+
 def evaluate_in_maze(
-    model: TrainedModel, method: str, seed: int, *, maze: str = "antmaze-large", episodes: int = 100,
-    engine: str = "auto", picture: Path | None = None, video: Path | None = None, horizon: int | None = None,
+    model: TrainedModel, method: str, seed: int, keep: Callable[[dict[str, Any]], None] = lambda row: None, *,
+    maze: str = "antmaze-large", episodes: int = 100, engine: str = "auto", picture: Path | None = None,
+    video: Path | None = None, horizon: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in one maze; returns its row of the table.
 
     Args:
+        keep: told the row before anything is drawn.
         horizon: control steps of an episode; by default in proportion to the longest way.
         picture: file for a picture of all episodes.
         video: file for a video of the first one.
@@ -185,8 +195,8 @@ def evaluate_in_maze(
     Raises:
         UserError: unknown maze, no episodes, or a picture or video that cannot be made there.
     """
-    if picture is not None and (picture.suffix not in PICTURES or not picture.parent.is_dir()):
-        raise UserError(f"--picture {picture}: give a {', '.join(PICTURES)} file in a folder that exists")
+    if picture is not None:
+        _check_picture(picture)
     if not 1 <= episodes <= MAX_EPISODES:
         raise UserError(f"--episodes {episodes}: give a number from 1 to {MAX_EPISODES}")
     check_horizon(horizon)
@@ -201,6 +211,7 @@ def evaluate_in_maze(
     name = Path(maze).stem
     outcome = _watched(env, world, pairs, method, name, model.policy, model.controller, model.settings.prm, horizon)
     row = head(model.robot, method, maze, len(pairs.start), seed) | outcome.summary()
+    keep(row)
     if picture is not None and devices.is_first():
         from ct_jax.report import pictures  # likewise
 

@@ -19,6 +19,7 @@ from ct_jax.agent import Agent
 from ct_jax.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
+from ct_jax.files import make_folder, whole
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
@@ -47,7 +48,7 @@ class TrainedModel:
 
 def save_model(folder: Path, model: TrainedModel) -> None:
     """Write a model into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
     (folder / "model.json").unlink(missing_ok=True)  # written last: it says that the weights are whole
     said = {"robot": model.robot, "settings": to_dict(model.settings)}
     save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller), of=said)
@@ -124,7 +125,7 @@ def _read_description(file: Path, mend: str) -> tuple[dict[str, Any], bool]:
 
 def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
     """Write a controller into a folder: ``weights.safetensors``, and last ``controller.json``."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, parents=True)
     said = {"robot": robot, "sac": asdict(config)}
     save_weights(folder / "weights.safetensors", controller, of=said)
     write_json(folder / "controller.json", _sizes(robot) | said | {"format": BOUND, "made": made})
@@ -168,7 +169,8 @@ def copy_controller(where: str, robot: str, folder: Path) -> None:
     """Copy a controller's files into a folder that exists, if ``load_controller`` takes it. Raises UserError, as it."""
     load_controller(where, robot)
     for name in ("weights.safetensors", "controller.json"):
-        (folder / name).write_bytes((_controller_folder(where, robot) / name).read_bytes())
+        with whole(folder / name) as opened:
+            opened.write((_controller_folder(where, robot) / name).read_bytes())
 
 
 def _controller_folder(where: str, robot: str) -> Path:

@@ -256,11 +256,13 @@ def results(folder: Path) -> list[dict[str, Any]]:
 
 @with_own_numerics
 def evaluate_model(
-    run: str, *, method: str, seed: int, optimism: float | None = None, **options: Any
+    run: str, *, method: str, seed: int, optimism: float | None = None,
+    keep: Callable[[dict[str, Any]], None] = lambda row: None, **options: Any
 ) -> dict[str, Any]:  # fmt: skip
     """Evaluate one method of a run folder or zoo model; returns its row of the table.
 
     Args:
+        keep: told the row as soon as it is there, before anything is drawn.
         optimism: k, in place of the model's own.
         options: of ``evaluate_in_maze`` or ``evaluate_in_rooms``, whichever the robot is for.
 
@@ -282,7 +284,7 @@ def evaluate_model(
     asked = {}
     if optimism is not None:
         model, asked = _asking(model, method, optimism), {"optimism": optimism}
-    return evaluation(model, method, seed, **options) | asked
+    return evaluation(model, method, seed, lambda row: keep(row | asked), **options) | asked
 
 
 def _asking(model: TrainedModel, method: str, optimism: float) -> TrainedModel:

@@ -2,10 +2,13 @@
 
 import json
 import math
+import secrets
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import BinaryIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -14,7 +17,9 @@ from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.summary import scalar
 
 from ct_jax.devices import is_first
+from ct_jax.files import append_to, make_folder
 from ct_jax.interrupts import raise_if_interrupted
+from ct_jax.terminal import one_line
 
 PLAIN_EVERY_S = 15.0  # where there is no terminal, a line this often
 
@@ -28,17 +33,18 @@ class Bar:
         Args:
             console: where to show it; by default stderr.
         """
-        self.name, self.total = name, total
+        self.name, self.total = one_line(name), total
         self._begun = self._spoke = time.monotonic()
         self._first: int | None = None
         console = console or Console(stderr=True)
         self._live, self._tells = None, is_first()
         if console.is_terminal and self._tells:
             self._live = Progress(
-                TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-                TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console,
+                TextColumn("{task.description:<12}", markup=False), BarColumn(), MofNCompleteColumn(),
+                TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+                console=console,
             )  # fmt: skip
-            self._task = self._live.add_task(name, total=total, note="")
+            self._task = self._live.add_task(self.name, total=total, note="")
 
     def __enter__(self) -> "Bar":
         if self._live:
@@ -72,7 +78,8 @@ class Bar:
 
     def _say(self, text: str) -> None:
         if self._tells:
-            print(f"{self.name}: {text}", file=sys.stderr, flush=True)
+            with suppress(OSError):  # a full disk under a log, or nobody there to read: the work goes on
+                print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
 
 class Metrics:
@@ -86,11 +93,12 @@ class Metrics:
         self._writes = is_first()
         if not self._writes:
             return
-        file, board = run / "metrics.jsonl", run / "tensorboard"
-        _drop_half_line(file)
-        board.mkdir(exist_ok=True)
-        self._file = file.open("a", encoding="utf-8")
-        self._board = EventsWriter(str(board / "events"))
+        board = run / "tensorboard"
+        make_folder(board)
+        self._file = append_to(run / "metrics.jsonl")
+        _drop_half_line(self._file)
+        # It would follow a link, so its name is one that nobody can know before.
+        self._board = EventsWriter(str(board / "events"), f".{secrets.token_hex(8)}")
         self._begun = time.monotonic()
 
     def log(self, stage: str, step: int, **values: float) -> None:
@@ -100,7 +108,7 @@ class Metrics:
         record: dict[str, str | float | None] = {"stage": stage, "step": step}
         record["time_s"] = round(time.monotonic() - self._begun, 3)
         finite = {name: value for name, value in values.items() if math.isfinite(value)}
-        self._file.write(json.dumps(record | dict.fromkeys(values) | finite) + "\n")
+        self._file.write(json.dumps(record | dict.fromkeys(values) | finite).encode() + b"\n")
         self._file.flush()
         for name, value in finite.items():
             summary = scalar(f"{stage}/{name}", value)
@@ -117,10 +125,6 @@ class Metrics:
             self._board.close()
 
 
-def _drop_half_line(file: Path) -> None:
+def _drop_half_line(file: BinaryIO) -> None:
     """Cut off the end of a last line that a killed process did not finish."""
-    if not file.is_file():
-        return
-    with file.open("rb+") as opened:
-        text = opened.read()
-        opened.truncate(text.rfind(b"\n") + 1)
+    file.truncate(file.read().rfind(b"\n") + 1)

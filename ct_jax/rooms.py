@@ -148,10 +148,13 @@ def evaluate_seven_pairs(model: TrainedModel, method: str, *, noise: float = 0.0
 
 
 def evaluate_in_rooms(
-    model: TrainedModel, method: str, seed: int, *, worlds: int = 20, pairs: int = 25, density: float = 1.0,
-    noise: float = 0.0, horizon: int | None = None,
+    model: TrainedModel, method: str, seed: int, keep: Callable[[dict[str, Any]], None] = lambda row: None, *,
+    worlds: int = 20, pairs: int = 25, density: float = 1.0, noise: float = 0.0, horizon: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One method of a model in random rooms; returns its row of the table.
+
+    Args:
+        keep: told the row as soon as it is there.
 
     Raises:
         UserError: numbers out of their range.
@@ -165,4 +168,6 @@ def evaluate_in_rooms(
         raise UserError(f"--noise {noise}: give a level from 0 to {MAX_NOISE}; 1 is that of a real robot")
     check_horizon(horizon)
     test = RoomTest(worlds, pairs, seed, density, noise, horizon)
-    return test.head(model.robot, method) | test.measure(model, method, *test.draw()).summary()
+    row = test.head(model.robot, method) | test.measure(model, method, *test.draw()).summary()
+    keep(row)
+    return row

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from ct_envs import Maze, MazeEnv, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
@@ -31,6 +30,7 @@ from ct_envs.robots import Robot, get_robot
 from ct_jax import __version__, devices
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.evaluate import Episodes
+from ct_jax.files import append_to, check_folders, drop_parts, make_folder, save_arrays
 from ct_jax.presets import Settings, to_dict
 from ct_jax.progress import Bar, Metrics
 
@@ -104,7 +104,7 @@ class Run:
         file, begun = folder / "spent.json", time.perf_counter()
 
         def begin() -> float:
-            folder.mkdir(exist_ok=True)
+            make_folder(folder)
             spent = read_json(file).get("wall_s") if file.is_file() else 0.0
             if not isinstance(spent, int | float):
                 raise UserError(f"{file}: 'wall_s' is no number; delete it and run again")
@@ -115,7 +115,7 @@ class Run:
         try:
             yield folder, info
         except BaseException:
-            with suppress(OSError):
+            with suppress(UserError):
                 if devices.is_first():
                     write_json(file, {"wall_s": round(before + time.perf_counter() - begun, 2)})
             raise
@@ -202,7 +202,7 @@ def _save_episodes(file: Path, episodes: Episodes) -> None:
     more = {name: getattr(episodes, name) for name in ("asked", "frontal", "grazing", "diverged")}
     more |= {"world": episodes.pairs.world}
     arrays |= {name: array for name, array in more.items() if array is not None}
-    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    save_arrays(file, **arrays)
 
 
 # ----------------------------------------------------------------------------------------------------------- mazes
@@ -275,6 +275,8 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
         def begin() -> None:
             _make_folder(run, resume)
             held.enter_context(_locked(run.folder))
+            check_folders(run.folder)
+            drop_parts(run.folder)
             config = run.folder / "config.json"
             if not config.is_file():
                 write_json(config, identity(run) | provenance())
@@ -307,7 +309,7 @@ def _make_folder(run: Run, resume: bool) -> None:
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Holds the folder; the system lets go of it when the process ends, however it ends."""
-    with (folder / "run.lock").open("a") as file:
+    with append_to(folder / "run.lock") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -19,6 +19,7 @@ from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_jax import devices
+from ct_jax.files import save_arrays
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
@@ -119,9 +120,7 @@ def arrays_of(trajectories: Trajectories) -> dict[str, np.ndarray]:
 def save(trajectories: Trajectories, file: Path) -> None:
     """Write to an ``.npz`` file (no pickle), of which a reader never sees half; several processes write one each."""
     own = _names(file, jax.process_count())[jax.process_index()]
-    part = own.with_name(f"part-{own.name}")
-    np.savez_compressed(part, **arrays_of(trajectories))  # pyright: ignore[reportArgumentType]
-    part.replace(own)
+    save_arrays(own, **arrays_of(trajectories))
     devices.largest(0)  # nobody goes on before all are there
 
 

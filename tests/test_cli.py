@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -97,9 +98,10 @@ def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
     asked = []
 
     @functools.wraps(pipeline._EVALUATIONS["maze"])
-    def listen(model, *args, **options):
+    def listen(model, method, seed, keep, **options):
         asked.append(model.policy.optimism)
-        return {"robot": model.robot}
+        keep(row := {"robot": model.robot})
+        return row
 
     monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
@@ -157,6 +159,8 @@ def test_version(capsys):
         ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
+        (["train"], ["mjx is some 30 times slower", "hosts that you trust"]),
+        (["evaluate"], ["mjx is some 30 times slower"]),
     ],
 )
 def test_help_teaches(command, words, capsys):
@@ -164,6 +168,7 @@ def test_help_teaches(command, words, capsys):
         main([*command, "--help"])
     out, err = capsys.readouterr()
     assert stop.value.code == 0 and err == ""
+    out = " ".join(out.split())  # as if there were no ends of lines
     assert [word for word in words if word not in out] == []
 
 
@@ -220,6 +225,7 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "RUN", "--video", "walk.gif"], ["--video walk.gif", ".mp4"]),
+        (["train", "point", "--coordinator", "::1:5", "--processes", "2", "--process", "0"], ["[fd00::1]:1234"]),
         (["evaluate", "zoo:nobody"], ["zoo:nobody", "models: zoo:"]),
         (["evaluate", "nowhere"], ["nowhere: no run folder", "ct-jax train"]),
         (["report", "nowhere"], ["nowhere"]),
@@ -234,6 +240,95 @@ def test_a_real_process_says_one_line_too():
     done = shell("-m", "ct_jax.cli", "train", "point", "--preset", "huge", env={"XDG_CACHE_HOME": os.devnull})
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     assert done.stderr.startswith("error: no preset named 'huge'")
+
+
+# ------------------------------------------------------------------------------------------------------ the outputs
+
+
+@pytest.mark.parametrize("option", ["--picture", "--video"])
+def test_an_output_that_cannot_be_written_is_told_before_the_work(
+    option, tiny, tiny_run, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("ct_jax.mazes.evaluate", lambda *_, **__: pytest.fail("it was evaluated"))
+    ending = {"--picture": "png", "--video": "mp4"}[option]
+    folder, file = tmp_path / f"folder.{ending}", tmp_path / "file"
+    folder.mkdir()
+    file.write_text("mine")
+    for wrong in (folder, file / f"x.{ending}", tmp_path / "nowhere" / f"x.{ending}"):
+        line = refused(capsys, "evaluate", tiny_run.folder, "--episodes", "2", option, wrong)
+        assert line.startswith(f"error: {option} {wrong}: cannot be written (")
+    assert sorted(tmp_path.iterdir()) == [file, folder]
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+@pytest.mark.parametrize(("stop", "status"), [(OSError(28, "No space left"), 2), (KeyboardInterrupt(), 130)])
+def test_the_row_is_printed_before_anything_is_drawn(
+    as_json, stop, status, tiny, tiny_run, tmp_path, monkeypatch, capsys
+):
+    def draw(*_):
+        raise stop
+
+    monkeypatch.setattr("ct_jax.report.pictures.write_paths", draw)
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--optimism", "0.5"]
+    assert main([*command, "--picture", str(tmp_path / "p.png"), *["--json"] * as_json]) == status
+    out = capsys.readouterr().out
+    if as_json:
+        assert json.loads(out)["optimism"] == 0.5
+    else:
+        assert out.splitlines()[1].split()[:2] == ["antmaze-umaze", "ct"]
+
+
+def test_a_row_that_stdout_cannot_take_is_told_on_stderr(tiny, tiny_run, monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "print_rows", full)
+    assert main(["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2"]) == 2
+    *_, row, error = capsys.readouterr().err.splitlines()
+    assert json.loads(row)["episodes"] == 2 and error.startswith("error: No space left on device")
+
+
+def test_commands_leave_nothing_where_they_are_run(tiny_run, tmp_path):
+    """Not of MuJoCo either, which has a log for its warnings."""
+    nowhere = tmp_path / "here"
+    nowhere.mkdir()
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    for command in (["mazes"], ["report", str(tiny_run.folder)], ["evaluate", "zoo:ant", "--episodes", "1"]):
+        assert shell("-m", "ct_jax.cli", *command, cwd=nowhere, env=cache).returncode == 0
+        assert list(nowhere.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------------------ the devices
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"JAX_PLATFORMS": "cuda"}, ["JAX_PLATFORMS='cuda'", "set JAX_PLATFORMS=cpu", "jax[cuda13]"]),
+        ({"JAX_PLATFORMS": "cupu"}, ["JAX_PLATFORMS='cupu'", "known backends", "set JAX_PLATFORMS=cpu"]),
+        ({"JAX_PLATFORMS": "tpu"}, ["JAX_PLATFORMS='tpu'", "set JAX_PLATFORMS=cpu"]),
+        ({"JAX_PLATFORMS": "rocm"}, ["JAX_PLATFORMS='rocm'", "set JAX_PLATFORMS=cpu"]),
+        ({"XLA_FLAGS": "--nonsense=1"}, ["XLA_FLAGS='--nonsense=1'", "Unknown flag", "unset"]),
+        ({"XLA_FLAGS": "nonsense"}, ["XLA_FLAGS='nonsense'", "Could not open file", "unset"]),
+        ({"XLA_FLAGS": "--xla_force_host_platform_device_count=many"}, ["XLA_FLAGS=", "value many", "unset"]),
+        ({"XLA_FLAGS": "--xla_force_host_platform_device_count=0"}, ["finds no device", "unset XLA_FLAGS"]),
+        ({"JAX_ENABLE_X64": "maybe"}, ["'maybe'", "JAX_ENABLE_X64", "correct the variable"]),
+    ],
+)
+def test_devices_that_do_not_start_are_told_in_one_line(variables, words):
+    try:
+        jax.devices(variables.get("JAX_PLATFORMS", "nothing"))
+        pytest.skip("this machine has it")
+    except RuntimeError:
+        pass
+    done = shell("-m", "ct_jax.cli", "evaluate", "zoo:point", "--episodes", "1", env=variables)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith("error: ") and [word for word in words if word not in done.stderr] == []
+
+
+def test_an_empty_choice_of_platform_is_jaxs(tmp_path):
+    code = "from ct_jax.cli import prepare_jax; prepare_jax(); import jax; print(len(jax.devices()) > 0)"
+    assert shell("-c", code, env={"JAX_PLATFORMS": "", "XLA_FLAGS": ""}, cwd=tmp_path).stdout == "True\n"
 
 
 # ------------------------------------------------------------------------------------------------------- bad mazes
@@ -357,25 +452,6 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(tiny, tiny_run, tmp_pat
     err = capsys.readouterr().err
     assert err.splitlines()[-1].startswith("error: ") and "No space left" in err and "Traceback" not in err
     assert main(command) == 0
-
-
-def test_weights_that_do_not_fit_on_the_disk(tmp_path, monkeypatch):
-    from safetensors import SafetensorError
-
-    from ct_envs import UserError
-    from ct_jax import checkpoint
-
-    def full(arrays, file, **more):
-        Path(file).write_bytes(b"half")
-        raise SafetensorError("I/O error: No space left on device")
-
-    file = tmp_path / "weights.safetensors"
-    checkpoint.save_weights(file, {"a": np.ones(3, np.float32)})
-    whole = file.read_bytes()
-    monkeypatch.setattr(checkpoint, "save_file", full)
-    with pytest.raises(UserError, match="No space left"):
-        checkpoint.save_weights(file, {"a": np.zeros(3, np.float32)})
-    assert file.read_bytes() == whole and list(tmp_path.iterdir()) == [file]
 
 
 # ---------------------------------------------------------------------------------------------------- interruption

@@ -140,6 +140,69 @@ def test_what_several_processes_wrote_is_shared_evenly(tmp_path, toy_data, monke
     assert [n for share in found for n in share] == [3, 4, 5, 6, 7] and max(map(len, found)) == 2
 
 
+LISTEN = """
+import os, sys
+from ct_envs import UserError
+from ct_jax import devices
+try:
+    devices.start(sys.argv[1], 1, 0)
+except UserError as bad:
+    print(bad)
+else:
+    for file in ("/proc/net/tcp", "/proc/net/tcp6"):
+        for line in open(file):
+            _, where, _, state, *_ = line.split()
+            if where.endswith(f":{int(sys.argv[1].rpartition(':')[2]):04X}") and state == "0A":
+                print(where.partition(":")[0])
+sys.stdout.flush()
+os._exit(0)
+"""
+LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F"}  # also as IPv6 writes it
+
+
+def listening(address: str) -> str:
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", LISTEN, address]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120).stdout
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").is_file(), reason="only Linux says who listens where")
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("localhost", LOOPBACK), ("127.0.0.1", LOOPBACK), ("[::1]", {"00000000000000000000000001000000"})],
+)
+def test_the_coordinator_listens_at_its_address_and_no_other(host, expected):
+    if host == "[::1]" and not _has_ipv6():
+        pytest.skip("no IPv6 here")
+    (found,) = listening(f"{host}:{free_port()}").splitlines()
+    assert found in expected or (host == "localhost" and found == "00000000000000000000000001000000")
+
+
+def _has_ipv6() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6) as tried:
+            tried.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
+def test_an_address_of_another_machine_is_refused(host):
+    with pytest.raises(UserError, match=rf"^--coordinator {host}:5: cannot listen there \(.*; give an address of"):
+        devices.listening_address(f"{host}:5")
+
+
+def test_a_port_that_is_taken_is_refused():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(UserError, match=r"cannot listen there \(Address already in use\)"):
+            devices.listening_address(address)
+    assert devices.listening_address(address) == address
+
+
 def test_processes_that_cannot_share_a_batch_are_told(monkeypatch):
     class Device:
         def __init__(self, process: int):

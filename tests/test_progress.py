@@ -77,7 +77,7 @@ def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
 def test_a_full_disk_is_an_error_and_no_hang(tmp_path):
     metrics = Metrics(tmp_path)
     metrics._file.close()
-    metrics._file = Path("/dev/full").open("w")  # noqa: SIM115
+    metrics._file = Path("/dev/full").open("wb")  # noqa: SIM115
     with pytest.raises(OSError, match="No space left"):
         metrics.log("fit", 1, loss=0.5)
     with contextlib.suppress(OSError):

@@ -5,9 +5,12 @@ import re
 from html import escape
 from html.parser import HTMLParser
 from io import BytesIO
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
@@ -15,6 +18,7 @@ from ct_envs import UserError
 from ct_envs.maze import draw_walls, load_walls
 from ct_jax.report import draw_maze, draw_paths, pictures, reading, words, write_report
 from ct_jax.report.page import page as to_html
+from ct_jax.terminal import printable
 
 SEEN, UNSEEN = "antmaze-umaze", "antmaze-medium"
 METHODS = ("ct", "planner", "explorer", "some-other")
@@ -377,11 +381,20 @@ def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
 
 @pytest.mark.parametrize(
     "name",
-    ['<script>alert("x")</script>', "a'b\"c&d", "$\\frac{1}{$", "../../etc/maze", "迷路 🤖", "\ud800", "x" * 200],
+    [
+        '<script>alert("x")</script>',
+        "a'b\"c&d",
+        "$\\frac{1}{$",
+        "../../etc/maze",
+        "迷路 🤖",
+        "\ud800",
+        "\x1b[31m",
+        "x" * 200,
+    ],
 )
 def test_a_name_is_only_ever_text(make_run, name):
     text, page = read(make_run(unseen=name))
-    shown = name.encode("utf-8", "replace").decode()
+    shown = printable(name)
     assert not any(tag == "script" for tag, _ in page.tags)
     assert shown in page.text
     assert escape(shown) in text
@@ -408,6 +421,45 @@ def test_a_maze_fills_its_figure_and_is_drawn_right_way_up(shape):
     middle = pixels[min(lowest_free, len(pixels) - 1), pixels.shape[1] // 2, :3].astype(int)
     if abs(figure.get_figwidth() / figure.get_figheight() * pictures.aspect(walls) - 1) < 0.01:
         assert (middle > 240).all()
+
+
+@pytest.mark.parametrize("success", [[True], [False], [True, False]])
+def test_a_picture_says_what_its_marks_mean(tmp_path, success):
+    path = np.full((3, len(success), 2), 6.0)
+    pairs = SimpleNamespace(start=path[0], goal=path[0] + 4)
+    steps = np.full(len(success), 3)
+    episodes = SimpleNamespace(pairs=pairs, path=path, steps=steps, success=np.array(success))
+    file = tmp_path / "picture.svg"
+    pictures.write_paths(file, load_walls("antmaze-umaze"), episodes, "a picture")
+    said = re.findall(r"<text[^>]*>([^<]*)</text>", file.read_text())
+    for word in ("start", "goal"):
+        assert word in said
+    assert ("reached the goal, light to dark in time" in said) == (True in success)
+    assert ("failed, light to dark in time" in said) == ("end of a failure" in said) == (False in success)
+
+
+@given(st.integers(4, 60), st.floats(1e3, 1e9), st.randoms())
+def test_an_outlier_leaves_room_for_all_others(n, far, random):
+    asked = np.linspace(-90, -10, n)
+    got = asked + np.array([random.uniform(-5, 5) for _ in range(n)])
+    with pictures.style():
+        _, alone = pictures.plot_figure()
+        pictures.draw_calibration(alone, asked, got, np.ones(n, bool))
+        _, ax = pictures.plot_figure()
+        more = np.append(asked, -far), np.append(got, -50.0), np.ones(n + 1, bool)
+        pictures.draw_calibration(ax, *more)
+    (low, high), whole = ax.get_xlim(), alone.get_xlim()
+    assert -200 < low < high < 50 and low <= whole[0] + 20
+    points = np.concatenate([np.asarray(dots.get_offsets()) for dots in ax.collections])
+    assert len(points) == n + 1 and (points >= low).all() and (points <= high).all()
+    assert "hollow: 1 beyond the axes" in [text.get_text() for text in ax.texts] and not alone.texts
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50))
+def test_the_bulk_of_values_holds_the_middle_half(values):
+    low, high = pictures.bulk(np.array(values))
+    inside = [value for value in values if low <= value <= high]
+    assert 2 * len(inside) >= len(values)
 
 
 @pytest.mark.parametrize("n", [1, 5])

@@ -11,7 +11,7 @@ import ct_jax
 ROOT = Path(__file__).parents[1]
 # Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
 ORDER = [
-    *["numerics", "compilation", "interrupts", "devices", "checkpoint", "progress"],
+    *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "progress"],
     *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
     *["drive", "explorer_turtlebot3", "collect_turtlebot3"],
     *["dense", "transformer", "value", "fit", "policy", "agent", "evaluate", "finetune"],

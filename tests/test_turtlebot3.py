@@ -5,6 +5,7 @@ import importlib.util
 import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -525,6 +526,26 @@ def test_a_pool_is_its_simulations_one_by_one(played, env):
 def test_the_number_of_processes_changes_nothing(played):
     with Turtlebot3Pool(3, processes=1) as alone:
         assert_equal_frames(played, play(alone, script()))
+
+
+@bullet
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="only Linux says how much it takes")
+def test_a_slot_takes_little_memory():
+    """PyBullet alone takes 35 MB."""
+    world = random_world(0)
+    point = next(p for p in np.random.default_rng(0).uniform(1, world.side_m - 1, (100, 2)) if world.clearance(p) > 0.2)
+    episode, most = Episode(world, point, point + 0.01), 9
+
+    def used_mb(pool):
+        text = Path(f"/proc/{pool.pids[0]}/smaps_rollup").read_text()
+        return int(re.search(r"Private_Dirty: *(\d+)", text)[1]) / 1024
+
+    with Turtlebot3Pool(most, processes=1) as pool:
+        pool.reset([episode])
+        first = used_mb(pool)
+        pool.reset([episode] * most)
+        pool.step(np.ones((most, 2)))
+        assert (used_mb(pool) - first) / (most - 1) < 15
 
 
 @bullet

@@ -1,17 +1,21 @@
 """Videos: MuJoCo draws what happened, in real time."""
 
+import os
+import resource
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ct_envs import UserError, load_maze
+from ct_envs import UserError, load_maze, make_maze
 from ct_envs.physics import build_model
-from ct_envs.robots import get_robot
+from ct_envs.robots import POINT, get_robot
 from ct_jax.report.video import SIZE, check_video, write_video
 
 av = pytest.importorskip("av")
+POSES = np.linspace([6.0, 6.0], [16.0, 6.0], 40, dtype=np.float32)  # of the point
 
 
 @pytest.fixture
@@ -54,12 +58,83 @@ def test_a_video_lasts_as_long_as_the_episode_and_follows_the_robot_to_its_goal(
 
 
 def test_what_cannot_be_written_is_told_in_a_line(tmp_path: Path):
-    for wrong in (tmp_path / "walk.gif", tmp_path / "nowhere" / "walk.mp4"):
-        with pytest.raises(UserError, match=r"give an \.mp4 file in a folder that exists"):
-            check_video(wrong)
+    (tmp_path / "folder.mp4").mkdir()
+    wrong = {"walk.gif": r"give an \.mp4 file", "nowhere/walk.mp4": "No such file", "folder.mp4": "Is a directory"}
+    for name, said in wrong.items():
+        with pytest.raises(UserError, match=f"^--video {tmp_path / name}: .*{said}"):
+            check_video(tmp_path / name)
+
+
+def test_a_disk_that_is_full_in_the_end_keeps_no_half(file: Path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
+    try:
+        with pytest.raises(UserError, match=rf"^{file}: cannot be written \(File too large\)"):
+            write_video(file, POINT, load_maze("antmaze-large"), POSES, np.array([18.0, 6.0]), "a walk")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(file.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["point", "ant", "humanoid"])
+def test_the_floor_is_neither_black_nor_white(file: Path, name: str):
+    """In a large room, at the lower edge of the picture, there is nothing but the floor."""
+    robot = get_robot(name)
+    model = build_model(robot)
+    qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (2, 1)).astype(np.float32)
+    qpos[:, :2] = 30.0
+    walls = np.pad(np.zeros((13, 13), bool), 1, constant_values=True)
+    write_video(file, robot, make_maze(walls), qpos, np.array([32.0, 40.0]), "a stand")
+    below = frames(file)[0][-40:].astype(int)
+    assert below.min() > 60 and below.max() < 240 and below.std() > 1
+
+
+# ---------------------------------------------------------------------------------------------------------- OpenGL
 
 
 def test_a_machine_without_opengl_is_told_what_it_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "mujoco.egl", None)
-    with pytest.raises(UserError, match=r"OpenGL without a display.*libegl1"):
+    for name, said in (("", "libegl1"), ("egl", "libegl1"), ("osmesa", "libosmesa6"), ("glfw", "needs a display")):
+        monkeypatch.setenv("MUJOCO_GL", name)
+        monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+        monkeypatch.setitem(sys.modules, f"mujoco.{name or 'egl'}", None)
+        with pytest.raises(UserError, match=f"a video needs OpenGL: .*{said}") as told:
+            check_video(tmp_path / "walk.mp4")
+        assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({"MUJOCO_GL": "nonsense"}, "MUJOCO_GL='nonsense': .*egl, osmesa, glfw"),
+        ({"MUJOCO_GL": "off"}, "MUJOCO_GL='off': .*unset it"),
+        ({"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "egl"}, "PYOPENGL_PLATFORM='egl': .*to be osmesa here; unset it"),
+        ({"PYOPENGL_PLATFORM": "nonsense"}, "PYOPENGL_PLATFORM='nonsense': .*to be egl here; unset it"),
+    ],
+)
+def test_variables_of_opengl_that_mean_nothing_are_told(tmp_path: Path, monkeypatch, variables: dict, said: str):
+    for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(UserError, match=said):
         check_video(tmp_path / "walk.mp4")
+
+
+@pytest.mark.parametrize("name", ["egl", "osmesa"])
+def test_the_named_way_to_opengl_is_taken(file: Path, monkeypatch, name: str):
+    """In a process of its own: OpenGL is loaded once. Where this way is not installed, a line says so."""
+    monkeypatch.setenv("MUJOCO_GL", name)
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    code = f"""
+import sys, pathlib, ct_envs.quiet
+from ct_envs import UserError
+from ct_jax.report.video import check_video
+try:
+    check_video(pathlib.Path({str(file)!r}))
+    print(*sorted(name for name in sys.modules if name in ("mujoco.egl", "mujoco.osmesa")))
+except UserError as bad:
+    print("mujoco.{name}" if "needs OpenGL" in str(bad) else bad)
+"""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout == f"mujoco.{name}\n", done.stderr

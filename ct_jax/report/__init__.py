@@ -6,7 +6,7 @@
 
 from pathlib import Path
 
-from ct_envs.errors import UserError
+from ct_jax.files import check_writable, write_text
 from ct_jax.report.overview import write_overview
 from ct_jax.report.page import page
 from ct_jax.report.pictures import draw_maze, draw_paths
@@ -25,12 +25,9 @@ def write_report(run: Path) -> Path:
         UserError: ``run`` is no run folder, or cannot be written to.
     """
     run = Path(run)
+    html, png = run / "report.html", run / "report.png"
     found = read_run(run)
-    html = run / "report.html"
-    text = page(found)
-    try:
-        html.write_text(text, encoding="utf-8", errors="replace")
-        write_overview(found, run / "report.png")
-    except OSError as error:
-        raise UserError(f"{run}: the report cannot be written ({error.strerror}); make the folder writable") from None
+    check_writable(html, png)
+    write_text(html, page(found))
+    write_overview(found, png)
     return html

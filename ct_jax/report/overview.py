@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ct_jax.files import whole
 from ct_jax.report import pictures, words
 from ct_jax.report.page import curves_of
 from ct_jax.report.pictures import LIGHT
@@ -58,7 +59,8 @@ def write_overview(run: Run, path: Path) -> None:
         for height, draw in blocks:
             draw(sheet, top)
             top += height
-        sheet.figure.savefig(path, format="png")
+        with whole(path) as opened:
+            sheet.figure.savefig(opened, format="png")
 
 
 def plain(text: str, most: int = 2000) -> str:

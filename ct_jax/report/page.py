@@ -18,6 +18,7 @@ from ct_jax import __version__
 from ct_jax.report import pictures, words
 from ct_jax.report.pictures import LIGHT
 from ct_jax.report.reading import METHODS, STAGES, Curve, Episodes, Run, number
+from ct_jax.terminal import printable
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # not even a browser looks outside
 MOST_MAZES = 12  # mazes drawn
@@ -101,8 +102,8 @@ def _variables() -> str:
 
 
 def _text(value: Any) -> str:
-    """Any value as text that is safe in HTML."""
-    return escape(str(value).encode("utf-8", "replace").decode())
+    """Any value as text that is safe in HTML, and on a terminal that shows it."""
+    return escape(printable(value))
 
 
 def _missing(what: str, file: str) -> str:

@@ -19,12 +19,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, StrMethodFormatter
 
 from ct_envs.turtlebot3_world import World
+from ct_jax.files import whole
 from ct_jax.report.reading import Place
+from ct_jax.terminal import printable
 
 if TYPE_CHECKING:
     from ct_jax.evaluate import Episodes
@@ -51,6 +55,7 @@ DARK = {
 _NAMES = {colour: name for name, colour in LIGHT.items()}
 _MOST_RUNS = 4000  # wall runs drawn as outlines; a larger maze becomes an image
 _HIDDEN = 0.6  # of a cell: how much of the outer ring of walls is cut off, for it says nothing
+_OUTLIER = 4.0  # times the range of the middle half: farther from it is an outlier
 _PIECES = 250  # pieces a path is cut into for each crossing of the maze
 
 _STYLE: dict[Any, Any] = {
@@ -86,7 +91,7 @@ def to_svg(figure: Figure, alt: str) -> str:
     text = re.sub(r"(\d\.\d\d)\d+", r"\1", text)
     text = re.sub(r"#[0-9a-f]{6}\b", lambda hit: f"var(--{_NAMES[hit[0]]})" if hit[0] in _NAMES else hit[0], text)
     box = re.search(r'viewBox="[^"]*"', text)
-    opening = f'<svg role="img" aria-label="{escape(alt)}" {box[0] if box else ""}>'
+    opening = f'<svg role="img" aria-label="{escape(printable(alt))}" {box[0] if box else ""}>'
     return opening + text[text.index(">") + 1 :].strip()
 
 
@@ -237,16 +242,41 @@ def draw_paths(
 
 def write_paths(file: Path, walls: Place, episodes: "Episodes", title: str) -> None:
     """Write a picture of a maze, or a room, and all episodes in it, in the format that the file's name says."""
-    width, top = 5.2, 0.3
+    width, top, bottom = 5.2, 0.3, 0.42
     height = width * aspect(walls)
+    whole_height = top + height + bottom
     with style():
-        figure = Figure(figsize=(width, height + top), facecolor=LIGHT["card"])
-        ax = figure.add_axes((0.0, 0.0, 1.0, height / (height + top)))
+        figure = Figure(figsize=(width, whole_height), facecolor=LIGHT["card"])
+        ax = figure.add_axes((0.0, bottom / whole_height, 1.0, height / whole_height))
         draw_maze(ax, walls)
         start, goal = episodes.pairs.start, episodes.pairs.goal
         draw_paths(ax, episodes.path, episodes.success, episodes.steps, start, goal, linewidth=0.8, size=0.6)
-        figure.text(0.5, 1 - 0.5 * top / (height + top), title, ha="center", va="center", fontsize=9)
-        figure.savefig(file, dpi=180)
+        figure.text(0.5, 1 - 0.5 * top / whole_height, printable(title), ha="center", va="center", fontsize=9)
+        _add_legend(figure, bool(episodes.success.any()), bool((~episodes.success).any()))
+        with whole(file) as opened:
+            figure.savefig(opened, format=file.suffix[1:], dpi=180)
+
+
+def _add_legend(figure: Figure, reached: bool, failed: bool) -> None:
+    """Say below a picture of paths what its marks and colours mean, as far as they are in it."""
+
+    def mark(marker: str, colour: str, size: float, edge: str) -> Line2D:
+        how = {"markeredgecolor": LIGHT[edge], "markeredgewidth": 0.4}
+        return Line2D([], [], linestyle="none", marker=marker, markersize=size, color=LIGHT[colour], **how)
+
+    def ramp(name: str) -> tuple[Line2D, ...]:
+        how = {"linewidth": 2.0, "solid_capstyle": "butt"}
+        return tuple(Line2D([], [], color=LIGHT[f"{name}{level}"], **how) for level in range(LEVELS))
+
+    key: dict[str, Any] = {"start": mark("o", "ink", 4, "card"), "goal": mark("*", "goal", 7, "ink")}
+    if reached:
+        key["reached the goal, light to dark in time"] = ramp("t")
+    if failed:
+        key |= {"failed, light to dark in time": ramp("f"), "end of a failure": mark("X", "fail", 6, "card")}
+    figure.legend(
+        key.values(), key.keys(), loc="lower center", ncols=3, frameon=False, fontsize=7, borderaxespad=0.3,
+        columnspacing=1.6, handler_map={tuple: HandlerTuple(ndivide=None, pad=0.0)},
+    )  # fmt: skip
 
 
 def _spacing(tracks: list[np.ndarray]) -> float:
@@ -349,16 +379,34 @@ def running_mean(values: np.ndarray) -> np.ndarray:
 
 
 def draw_calibration(ax: Axes, asked: np.ndarray, got: np.ndarray, success: np.ndarray) -> None:
-    """Scatter the return an episode was asked for against what it got; on the line, the promise was kept."""
-    both = np.concatenate([asked, got])
-    margin = 0.05 * float(np.ptp(both)) or 1.0
-    low, high = float(both.min()) - margin, float(both.max()) + margin
+    """Scatter the return an episode was asked for against what it got; on the line, the promise was kept.
+
+    Outliers would leave no room for all others: they are put on the edge, hollow and counted.
+    """
+    low, high = bulk(np.concatenate([asked, got]))
+    margin = 0.05 * (high - low) or 1.0
+    low, high = low - margin, high + margin
+    beyond = (np.minimum(asked, got) < low) | (np.maximum(asked, got) > high)
     ax.plot([low, high], [low, high], color=LIGHT["muted"], linewidth=1, linestyle=(0, (4, 3)), zorder=1)
     for chosen, colour, marker, size in ((success, "accent", "o", 16), (~success, "fail", "X", 26)):
-        ax.scatter(
-            asked[chosen], got[chosen], s=size, marker=marker, color=LIGHT[colour], alpha=0.8,
-            edgecolors=LIGHT["card"], linewidths=0.4, zorder=2,
-        )  # fmt: skip
+        for those, face, edge, width in ((chosen & ~beyond, colour, "card", 0.4), (chosen & beyond, None, colour, 0.9)):
+            ax.scatter(
+                np.clip(asked[those], low, high), np.clip(got[those], low, high), s=size, marker=marker, alpha=0.8,
+                facecolors=LIGHT[face] if face else "none", edgecolors=LIGHT[edge], linewidths=width, zorder=2,
+                clip_on=False,
+            )  # fmt: skip
+    if n := int(beyond.sum()):
+        where = {"transform": ax.transAxes, "ha": "right", "va": "bottom", "fontsize": 7, "color": LIGHT["muted"]}
+        ax.text(0.98, 0.03, f"hollow: {n} beyond the axes", **where)
     ax.set(xlim=(low, high), ylim=(low, high), xlabel="return asked for", ylabel="return got", aspect="equal")
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def bulk(values: np.ndarray) -> tuple[float, float]:
+    """The least and the greatest of the values that are no outliers: those within four times the range of the middle
+    half around it."""
+    first, third = np.percentile(values, [25, 75])
+    reach = _OUTLIER * (third - first)
+    inside = values[(values >= first - reach) & (values <= third + reach)] if reach else values
+    return float(inside.min()), float(inside.max())

@@ -1,8 +1,11 @@
 """Videos of episodes in mazes, by MuJoCo's own renderer without a display, as mp4."""
 
+import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 
 import mujoco
@@ -11,21 +14,28 @@ from jaxtyping import Float
 
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, unpadded
-from ct_envs.physics import static_model
+from ct_envs.physics import static_spec
 from ct_envs.robots import Robot
+from ct_jax.files import check_writable, whole
 from ct_jax.progress import Bar
 
 SIZE = 480, 640  # pixels, height and width
 MOST_FPS = 25
 _LAG_S = 0.4  # of the camera: else a robot that sways shakes the maze
-_NEEDS = "a video needs OpenGL without a display (on Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
+_NEEDS = {  # by the value of MUJOCO_GL, and on Debian and Ubuntu
+    "egl": "apt install libegl1 libgl1-mesa-dri",
+    "osmesa": "apt install libosmesa6, or set MUJOCO_GL=egl",
+    "glfw": "glfw needs a display; without one set MUJOCO_GL=egl",
+}
+_ANY = ("", "enable", "enabled", "on", "true", "1", "glx")  # values of MUJOCO_GL that name no way
 _TRAIL_EVERY_M, _TRAIL_MOST = 0.4, 400
 
 
 def check_video(file: Path) -> None:
     """Raises UserError if no video could be written to the file: told before an evaluation, not after it."""
-    if file.suffix != ".mp4" or not file.parent.is_dir():
-        raise UserError(f"--video {file}: give an .mp4 file in a folder that exists")
+    if file.suffix != ".mp4":
+        raise UserError(f"--video {file}: give an .mp4 file")
+    check_writable(file, option="--video")
     try:
         import av  # noqa: F401  an optional part
     except ImportError:
@@ -48,7 +58,11 @@ def write_video(
 
     stride = max(1, round(1 / (MOST_FPS * robot.control_dt_s)))
     frames, frame_s = qpos[::stride], stride * robot.control_dt_s
-    with av.open(str(file), "w", options={"movflags": "faststart"}) as container, Bar("video", len(frames)) as bar:
+    with (
+        whole(file) as opened,
+        av.open(opened.name, "w", format="mp4", options={"movflags": "faststart"}) as container,
+        Bar("video", len(frames)) as bar,
+    ):
         container.metadata["title"] = caption
         stream = container.add_stream("h264", rate=Fraction(1 / frame_s).limit_denominator(1000))
         stream.height, stream.width = SIZE
@@ -95,9 +109,19 @@ def _images(robot: Robot, maze: Maze, qpos: np.ndarray, goal: np.ndarray, *, fol
 
 
 def _scenery(robot: Robot, maze: Maze) -> mujoco.MjModel:
-    """The robot in the whole maze, brightly lit."""
-    walls = unpadded(maze)
-    model = static_model(robot, walls.tobytes(), *walls.shape, cell_m=float(maze.cell_m))
+    """The robot in the whole maze, brightly lit, on a floor of tiles that shows how it moves."""
+    spec = static_spec(robot, unpadded(maze), float(maze.cell_m))
+    spec.add_texture(
+        name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.60, 0.62, 0.64], rgb2=[0.54, 0.56, 0.58], width=256, height=256,
+    )  # fmt: skip
+    tiles = spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True)  # a tile is 2 m wide
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    floor = spec.geom("floor") or spec.worldbody.add_geom(  # the point slides on none
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 5], contype=0, conaffinity=0
+    )
+    floor.material, floor.rgba = "tiles", [1, 1, 1, 1]
+    model = spec.compile()
     model.vis.global_.offheight, model.vis.global_.offwidth = SIZE
     model.vis.headlight.ambient[:] = 0.4
     return model
@@ -111,16 +135,32 @@ def _mark(scene: mujoco.MjvScene, at: np.ndarray, radius_m: float, rgba: tuple, 
     scene.ngeom += 1
 
 
+def _backend() -> str:
+    """Which of MuJoCo's ways to OpenGL to take: the one that MUJOCO_GL names, or EGL. Raises UserError."""
+    given = os.environ.get("MUJOCO_GL", "").lower().strip()
+    name = "egl" if given in _ANY else given
+    if name not in _NEEDS:
+        known = ", ".join(_NEEDS)
+        raise UserError(f"MUJOCO_GL='{given}': no way to draw a video; unset it, or give one of: {known}")
+    other = os.environ.get("PYOPENGL_PLATFORM", "")
+    if name != "glfw" and other and other.lower() != name:
+        raise UserError(f"PYOPENGL_PLATFORM='{other}': a video needs it to be {name} here; unset it")
+    return name
+
+
 @contextmanager
 def _context(height: int, width: int) -> Iterator[None]:
-    """OpenGL without a display, whatever MUJOCO_GL says. Raises UserError where there is none."""
+    """OpenGL, without a display unless MUJOCO_GL asks for one. Raises UserError where there is none."""
+    name = _backend()
     try:
-        from mujoco.egl import GLContext  # fails in many ways where a library is missing
-
-        context = GLContext(width, height)
-        context.make_current()
+        with warnings.catch_warnings(action="ignore"):  # GLFW warns of what the error says
+            context = import_module(f"mujoco.{name}").GLContext(width, height)  # fails in many ways
+            if not context._context:
+                raise RuntimeError("it makes no context")
+            context.make_current()
     except Exception as error:
-        raise UserError(f"{_NEEDS}; here it says: {error or type(error).__name__}") from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"a video needs OpenGL: {_NEEDS[name]}; here it says: {reason}") from None
     try:
         yield
     finally:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 from mujoco.batch import Batch
 
@@ -207,9 +207,13 @@ def _digest(model: mujoco.MjModel, n_substeps: int) -> str:
 @functools.cache
 def static_model(robot: Robot, walls: bytes, height: int, width: int, cell_m: float = CELL_M) -> mujoco.MjModel:
     """A model with every wall built in: slow, and the truth that the movable boxes are tested against."""
+    return static_spec(robot, np.frombuffer(walls, bool).reshape(height, width), cell_m).compile()
+
+
+def static_spec(robot: Robot, walls: Bool[np.ndarray, "h w"], cell_m: float) -> mujoco.MjSpec:
+    """The robot in a maze, to be compiled."""
     spec = mujoco.MjSpec.from_string(model_xml(robot))
-    grid = np.frombuffer(walls, bool).reshape(height, width)
-    for row, column in np.argwhere(grid):
+    for row, column in np.argwhere(walls):
         body = spec.worldbody.add_body(pos=[(column + 0.5) * cell_m, (row + 0.5) * cell_m, WALL_HEIGHT_M / 2])
         add_wall(body, cell_m)
-    return spec.compile()
+    return spec

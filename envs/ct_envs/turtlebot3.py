@@ -46,6 +46,7 @@ _HEIGHT_M = 0.5  # of walls and obstacles
 _TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
 _SETTLE = 12  # physics steps in which a robot that was put down comes to rest
 _FRONTAL = np.cos(np.pi / 4)  # a contact within 45 degrees of the way the robot drives is frontal
+_RENDERER = "tinyRendererPlugin"
 _WHEELS = ("wheel_left_joint", "wheel_right_joint")
 # What may meet what: body and obstacles, wheels and floor, and rays (of group 1, that is PyBullet's) obstacles alone.
 _RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
@@ -159,6 +160,7 @@ class Turtlebot3Env:
         self._urdf = _urdf_file(config.urdf)
         self._bullet = load_pybullet()
         self._client = self._bullet.connect(self._bullet.DIRECT)
+        self._drop_renderer()
         self._world: World | None = None
         self._done = True
 
@@ -250,6 +252,11 @@ class Turtlebot3Env:
         end = begin + LIDAR_RANGE_M * np.stack([np.cos(angle), np.sin(angle), np.zeros(LIDAR_BEAMS)], -1)
         hits = self._bullet.rayTestBatch(begin.tolist(), end.tolist(), physicsClientId=self._client)
         return LIDAR_RANGE_M * np.array([hit[2] for hit in hits])
+
+    def _drop_renderer(self) -> None:
+        """Unload the renderer, which nothing here draws with: a quarter of a simulation's memory is its pictures."""
+        if (renderer := self._bullet.loadPlugin(_RENDERER, physicsClientId=self._client)) >= 0:  # the one there is
+            self._bullet.unloadPlugin(renderer, physicsClientId=self._client)
 
     def _build(self, world: World, start: np.ndarray, yaw_rad: float) -> None:
         """Everything anew: an old simulation's caches would make the episode depend on the one before."""

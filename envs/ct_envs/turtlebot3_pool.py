@@ -2,7 +2,8 @@
 
 All slots are stepped together. An episode depends on nothing but its world, start, goal, seed and actions, so the
 number of processes changes nothing; and where a process dies, another one takes its place and drives its episodes
-again up to where they were: who uses the pool does not notice, but for the time it takes.
+again up to where they were: who uses the pool does not notice, but for the time it takes. A slot takes 9 MB, and a
+process 70 MB besides.
 
 Processes are spawned, so a script that makes a pool needs ``if __name__ == "__main__":``.
 """
@@ -22,6 +23,7 @@ import numpy as np
 
 from ct_envs.errors import UserError
 from ct_envs.lidar import LIDAR_BEAMS, MAP_CELLS
+from ct_envs.memory import zeros_given_back
 from ct_envs.turtlebot3 import Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_world import World
 
@@ -254,7 +256,8 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
     frames = {}
     for slot, episode in episodes.items():
         if slot not in envs:
-            envs[slot] = Turtlebot3Env(config)
+            with zeros_given_back():  # this thread is the process's only one that works
+                envs[slot] = Turtlebot3Env(config)
         env = envs[slot]
         obs = env.reset(episode.world, episode.start, episode.goal, seed=episode.seed, yaw_rad=episode.yaw_rad)
         frames[slot] = _frame(obs, 0.0, False, env.sight())

@@ -1,0 +1,51 @@
+"""Memory that is given back holds what it held."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ct_envs.memory import zeros_given_back
+
+STATUS = Path("/proc/self/smaps_rollup")
+pytestmark = pytest.mark.skipif(not STATUS.is_file(), reason="only Linux says how much memory a process takes")
+MEGABYTES = 64
+
+
+def dirty_mb() -> float:
+    """Memory that is this process's alone, and written [MB]."""
+    return next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if "Private_Dirty" in line) / 1024
+
+
+def fill(array: np.ndarray, pattern: str) -> None:
+    array[:] = 0  # written, so that the system has to hold it
+    if pattern == "ones":
+        array[:] = 1
+    elif pattern == "some":
+        array[:: len(array) // 5] = 1
+    elif pattern == "ends":
+        array[[0, -1]] = 1
+
+
+@pytest.mark.parametrize("pattern", ["zeros", "ones", "some", "ends"])
+def test_what_is_in_memory_stays_and_zeros_take_none(pattern):
+    with zeros_given_back():
+        array = np.empty(MEGABYTES * 2**20, np.uint8)
+        fill(array, pattern)
+        full = dirty_mb()
+    freed = full - dirty_mb()
+    expected = np.empty_like(array)
+    fill(expected, pattern)
+    assert (array == expected).all()
+    assert (freed > MEGABYTES - 25) == (pattern != "ones") and (pattern != "ones" or abs(freed) < 5)
+    array[:] = 2  # and it can be written
+    assert (array == 2).all()
+
+
+def test_what_was_there_before_is_left_alone():
+    array = np.empty(MEGABYTES * 2**20, np.uint8)
+    array[:] = 0
+    before = dirty_mb()
+    with zeros_given_back():
+        pass
+    assert abs(dirty_mb() - before) < 5 and not array.any()

@@ -1,0 +1,75 @@
+"""MuJoCo does nothing unasked: no file, no word, and no way to draw is needed to step."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+STEP = """
+import logging, sys
+import jax, jax.numpy as jnp
+from ct_envs import MazeEnv, load_maze
+env = MazeEnv("ant", engine="mujoco", auto_reset=False, maps=False)
+state = jax.jit(env.reset)(jax.random.key(0), load_maze("antmaze-umaze"))
+physics = state.pipeline_state.replace(qvel=jnp.full(env.engine.model.nv, 1e12))
+state = jax.jit(env.step)(state.replace(pipeline_state=physics), jnp.zeros(env.action_size))
+print(float(state.done), float(state.info["success"]))
+"""
+NAN = """
+import logging, sys
+if len(sys.argv) > 1:
+    logging.basicConfig(level=logging.INFO, format="%(name)s %(message)s")
+import ct_envs.quiet
+import mujoco, numpy as np
+ball = "<body><freejoint/><geom size='.1'/></body>"
+model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
+data = mujoco.MjData(model)
+data.qvel[:] = np.nan
+mujoco.mj_step(model, data)
+try:
+    mujoco.MjModel.from_xml_string("<mujoco><bad/></mujoco>")
+except ValueError as error:
+    print(error)
+"""
+
+
+def python(code: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | variables
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=environment, cwd=cwd
+    )
+
+
+def test_warnings_go_to_a_logger_and_errors_stay(tmp_path):
+    done = python(NAN, cwd=tmp_path)
+    assert "bad" in done.stdout and done.stderr == ""
+    assert "ct_envs.mujoco Nan, Inf or huge value in Q" in python(NAN, "log", cwd=tmp_path).stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_state_that_explodes_ends_the_episode_and_leaves_no_log(tmp_path):
+    done = python(STEP, cwd=tmp_path)
+    assert (done.stdout, done.stderr) == ("1.0 0.0\n", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_warning_handler_of_ones_own_stays(tmp_path):
+    code = "import mujoco; mujoco.set_mju_user_warning(print); import ct_envs.quiet"
+    assert python(f"{code}; assert mujoco.get_mju_user_warning() is print", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize("value", ["nonsense", "osmesa", "egl", "glfw", "off", ""])
+def test_physics_does_not_ask_for_a_way_to_draw(value, tmp_path):
+    code = "import os; from ct_envs import MazeEnv; MazeEnv('point'); print(*map(os.environ.get, ('MUJOCO_GL', 'X')))"
+    done = python(code, cwd=tmp_path, MUJOCO_GL=value)
+    assert done.stdout == f"{value} None\n", done.stderr
+
+
+@pytest.mark.parametrize("first", ["", "import ct_envs.quiet;"])
+def test_what_mujoco_draws_with_is_there_as_it_would_be(first, tmp_path):
+    code = "import os, mujoco; print(getattr(mujoco, 'GLContext', None), os.environ.get('PYOPENGL_PLATFORM'))"
+    assert (
+        python(first + code, cwd=tmp_path, MUJOCO_GL="egl").stdout == python(code, cwd=tmp_path, MUJOCO_GL="egl").stdout
+    )
