@@ -3,9 +3,9 @@
     python experiments/ant.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--controller own|zoo]
 
 With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. A planner and an
-explorer stand beside them. All methods meet the same 100 start-goal pairs. A low-level controller of your own takes
-longest on two cores; ``--controller zoo`` takes the shipped one. ``zoo:ant`` is ``calm-ct``. Writes
+published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. Planner and explorer
+are the references. All methods have the same 100 start-goal pairs. Training your own low-level controller
+takes longest on two cores; ``--controller zoo`` uses the shipped one. ``zoo:ant`` is ``calm-ct``. Writes
 ``experiments/results/ant-PRESET.json``.
 """
 
@@ -13,18 +13,18 @@ from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_conf
 
 BC = {"model.returns": False}
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 40, "round_fit": half_the_updates}
-# Without fine-tuning: the updates of the last training at once, its timesteps shifted at random.
+# Without fine-tuning: all updates of the last training at once, with timesteps shifted at random.
 CT = {"rounds": 0, "fit.updates": 2500, "fit.warmup": 20, "fit.decay": True, "fit.shift_timestep": 300}
 LONG_CT = CT | {"fit.updates": 5000}
 LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
 MODES_CT = CT | {"model.modes": 4}
-MODES = {"model.modes": 4, "model.commitment": 3.0}  # Only who has learned from failures keeps to a mode.
-CALM = {"controller_effort": 0.75}  # of the controller's range: it falls less; chosen in the training maze
-MEMORY = {"model.stride": 3}  # as many steps remembered, farther apart
-# The head is the low-level controller, as it was learned: of one controller one gait, so mirrored worlds only turn.
+MODES = {"model.modes": 4, "model.commitment": 3.0}  # Commitment only for models that learned from failures.
+CALM = {"controller_effort": 0.75}  # share of the controller's range: the ant falls less; chosen in the training maze
+MEMORY = {"model.stride": 3}  # the same number of steps in memory, farther apart
+# The action head is the fixed low-level controller. It has one gait, so data are only rotated, not reflected.
 SKILL = {"model.skill": True, "fit.turns": True, "round_fit.turns": True, "last_fit.turns": True}
-ROAM = {"recover.random_mazes": 100}  # CT of the one maze, which looks for its failures in others
-# Trajectories and recoveries of 100 random mazes besides; CT and F-CT after as many updates in all.
+ROAM = {"recover.random_mazes": 100}  # CT trained in one maze; recoveries also from random mazes
+# Also trajectories and recoveries from 100 random mazes. CT and F-CT have the same total number of updates.
 MAZES = {
     "random_mazes": 100, "collect.trajectories": 2500, "collect.reset_interval": 10, "rounds": 6,
     "fit.updates": 600, "fit.shift_timestep": 300, "round_fit.updates": 200, "round_fit.shift_timestep": 300,
@@ -32,7 +32,7 @@ MAZES = {
 }  # fmt: skip
 MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
 
-SHIPPED = "calm-ct"  # the variant that zoo:ant is
+SHIPPED = "calm-ct"  # the variant of zoo:ant
 
 VARIANTS = {
     "published": Variant("published", label="CT"),

@@ -1,10 +1,10 @@
-"""Ships low-level controllers with the package: copies those of finished runs into it.
+"""Ships low-level controllers with the package: copies the controllers of finished runs into it.
 
     python experiments/controllers.py --ship runs/ant/cpu-ct-0
 
-A shipped controller is what ``--controller zoo`` means. It is the weights and ``controller.json``: its settings; the
-command, commit and machine that made it; its success on held-out edges in the course of its training; and the time.
-``experiments/pages.py`` writes ``docs/results/controllers.md`` from them.
+``--controller zoo`` uses a shipped controller. It consists of the weights and ``controller.json``: its settings; the
+command, commit and machine that made it; its success on held-out edges during its training; and the training time.
+``experiments/pages.py`` writes ``docs/results/controllers.md`` from these files.
 """
 
 import json
@@ -28,18 +28,18 @@ class Options:
     """What to ship."""
 
     ship: tuple[Path, ...] = ()
-    """Runs whose controllers the package is to ship, in place of those that it has of their robots."""
+    """Runs whose controllers to ship. They replace the shipped controllers of the same robots."""
 
 
 def ship(run: Path) -> None:
-    """Take over a run's controller, with the curve of its training.
+    """Copy a run's controller into the package, with its learning curve.
 
     Raises:
-        UserError: the run has none that is finished.
+        UserError: the run has no finished controller of its own.
     """
     folder = run / "controller"
     if not (folder / "done.json").is_file():
-        raise UserError(f"{run}: has no finished controller of its own; train it, or go on with --resume")
+        raise UserError(f"{run}: has no finished controller of its own; train one, or continue the run with --resume")
     robot = read_json(folder / "controller.json")["robot"]
     (ZOO / robot).mkdir(exist_ok=True)
     shutil.copy(folder / "weights.safetensors", ZOO / robot)
@@ -47,22 +47,22 @@ def ship(run: Path) -> None:
 
 
 def described(run: Path) -> dict[str, Any]:
-    """A run's ``controller.json``, with its training's wall time [s] and, by iteration, success on held-out edges.
+    """A run's ``controller.json``, with the training time [s] and the success on held-out edges by iteration.
 
     Raises:
-        UserError: the run took over its controller from another.
+        UserError: the run did not train its controller.
     """
     found = read_json(run / "controller" / "controller.json")
     lines = map(json.loads, (run / "metrics.jsonl").read_text("utf-8").splitlines())
     tests = {line["step"]: line["held_out"] for line in lines if line["stage"] == "controller" and "held_out" in line}
     if not tests:
-        raise UserError(f"{run}: its controller was learned in another run; give that one")
+        raise UserError(f"{run}: its controller was trained in another run; give that run")
     wall_s = read_json(run / "controller" / "done.json")["wall_s"]
     return found | {"made": found["made"] | {"wall_s": wall_s, "curve": sorted(tests.items())}}
 
 
 def main(options: Options) -> None:
-    """Ship, and say what there is."""
+    """Ship the controllers, and print all shipped ones."""
     for run in options.ship:
         ship(run)
     for file in sorted(ZOO.glob("*/controller.json")):

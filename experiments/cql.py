@@ -1,4 +1,4 @@
-"""Chooses PT-CQL's settings as fairly as the other methods': in the training maze, on pairs that no table uses.
+"""Chooses PT-CQL's settings, as fairly as for the other methods: in the training maze, on pairs that no table uses.
 
     python experiments/cql.py --robot ant [--alpha 0.05 0.2 1 5] [--target-rate 0.005 0.05] [--controller zoo]
 
@@ -33,21 +33,21 @@ class Options:
     target_rate: tuple[float, ...] = (0.005, 0.05)
     """Shares of the new critics in the target critics at each update."""
     reward_scale: tuple[float, ...] = (0.1,)
-    """Of the reward in the critics' units."""
+    """Factors of the reward in the critics' targets."""
     imitation: tuple[int, ...] = (0,)
-    """First updates in which the policy imitates the data."""
+    """Numbers of first updates in which the policy imitates the data."""
     updates: int = 2500
-    """Of each training."""
+    """Updates of each training."""
     controller: str = "zoo"
     """own, zoo, or a run folder."""
     seed: int = 0
-    """Of the data and the trainings."""
+    """Seed of the data and of the training."""
     out: Path = Path("runs/cql")
-    """Folder of the trainings; what is finished there is not run again."""
+    """Folder for the models; finished ones are not trained again."""
 
 
 def main(options: Options) -> None:
-    """Try all choices; each is written down as soon as it is measured."""
+    """Try all choices; write each result as soon as it is measured."""
     prepare_jax()
     variants = load_variants(options.robot)
     if "pt-cql" not in variants:
@@ -67,7 +67,7 @@ def main(options: Options) -> None:
 
 
 def keep(rows: list[CqlRow]) -> None:
-    """Add rows to the results file in place of those with the same settings, and print all of the robot."""
+    """Write rows to the results file, replacing rows with the same settings, and print all rows of the robot."""
     kept = replace_rows(RESULTS / "cql.json", rows, ("robot", *VARIED), CqlRow)
     short = lambda row: " ".join(f"{name[0]}{getattr(row, name):g}" for name in VARIED)  # noqa: E731
     print_rows([row.values() | {"method": short(row)} for row in kept if row.robot == rows[0].robot])

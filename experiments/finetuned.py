@@ -1,12 +1,12 @@
-"""Measures what fine-tuning adds, on more pairs than the tables have: F-CT − CT in unseen mazes, pair by pair.
+"""Measures the gain from fine-tuning, F-CT − CT in unseen mazes, pair by pair, on more pairs than the tables have.
 
     python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned modes] [--runs runs/ant] [--maze validation-2]
 
-In ``antmaze-large-eval``; and, for choosing settings, in ``validation-1`` to ``-3``, which no table uses.
+The default maze is ``antmaze-large-eval``. Use ``validation-1`` to ``-3``, which no table uses, to choose settings.
 
 Needs the finished runs ``cpu-ct-SEED`` and ``cpu-SEED`` (or those of another ``--tuned``) of
-``experiments/ROBOT.py --preset cpu``, with the same low-level controller. Both models of a seed meet the same pairs of
-seed 1; the tables use seed 0. Writes ``experiments/results/finetuned.json``.
+``experiments/ROBOT.py --preset cpu``, with the same low-level controller. Both models of a seed are evaluated on the
+same pairs, of seed 1; the tables use seed 0. Writes ``experiments/results/finetuned.json``.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from ct_jax.progress import Bar
 from ct_jax.run import provenance
 
 FILE = RESULTS / "finetuned.json"
-LONGER = "long-ct"  # CT with about as many updates as F-CT has in all
+LONGER = "long-ct"  # CT with about the same total number of updates as F-CT
 PAIRS_SEED = 1
 
 
@@ -35,9 +35,9 @@ class Options:
     robot: str = "point"
     """point, ant or humanoid."""
     tuned: str = "cpu"
-    """The fine-tuned variant to compare with the variant that it was before."""
+    """The fine-tuned variant; it is compared with the variant before fine-tuning."""
     longer: bool = False
-    """Compare with long-ct instead, which has about as many updates as F-CT."""
+    """Compare with long-ct instead, which has about the same number of updates as F-CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
     runs: Path | None = None
@@ -69,7 +69,7 @@ def measure(options: Options, variant: str, seed: int, maze_name: str) -> Row:
 
 
 def before_of(options: Options) -> str:
-    """The variant to compare with. Raises UserError where ``--tuned`` names none that was fine-tuned."""
+    """The variant to compare with. Raises UserError if ``--tuned`` does not name a fine-tuned variant."""
     tuned = {name: variant.tuned_from for name, variant in load_variants(options.robot).items() if variant.tuned_from}
     if options.tuned not in tuned:
         raise UserError(f"--tuned {options.tuned}: no fine-tuned variant; give one of {', '.join(tuned)}")
@@ -77,14 +77,14 @@ def before_of(options: Options) -> str:
 
 
 def main(options: Options) -> None:
-    """Measure all, seed by seed and maze by maze; each pair of rows is written down as soon as it is measured."""
+    """Measure all seeds and mazes; write each pair of rows as soon as it is measured."""
     prepare_jax()
     variants = (before_of(options), options.tuned)
     for seed in options.seeds:
         for maze in options.maze:
             before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before.controller != after.controller:
-                raise UserError(f"the models of seed {seed} have different low-level controllers; train both anew")
+                raise UserError(f"the models of seed {seed} have different low-level controllers; train both again")
             replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"), Row)
             print_rows([row.values() | {"method": row.variant} for row in (before, after)])
 

@@ -22,8 +22,8 @@ def pooled(rows: Sequence[Scored], name: str) -> str:
 def rate_of(rows: Sequence[Scored], name: str) -> tuple[float, float, float]:
     """A rate of all models together and the ends of its interval [%].
 
-    Models differ and meet the same pairs, so of several the wider of two intervals is taken: Wilson's, and a bootstrap
-    over models and pairs.
+    Several models are evaluated on the same pairs, so their episodes are not independent. Their interval is the wider
+    of two: Wilson's, and a bootstrap over models and pairs.
     """
     n = sum(row.episodes for row in rows)
     low, high = wilson_of(sum(round(row.rate(name) * row.episodes) for row in rows), n)
@@ -35,7 +35,7 @@ def rate_of(rows: Sequence[Scored], name: str) -> tuple[float, float, float]:
 
 
 def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the mean of values [models, pairs]: a bootstrap that draws both models and pairs."""
+    """95 % interval of the mean of values [models, pairs]: a bootstrap over both models and pairs."""
     rng = np.random.default_rng(0)
     models, pairs = (rng.integers(n, size=(10_000, n)) for n in values.shape)
     means = [values[np.ix_(m, p)].mean() for m, p in zip(models, pairs, strict=True)]
@@ -43,11 +43,11 @@ def interval_of_mean(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-Pair = tuple[Row, Row]  # of one model before and after fine-tuning
+Pair = tuple[Row, Row]  # the rows of one model before and after fine-tuning
 
 
 def of_one_model(before: Iterable[Row], after: Iterable[Row]) -> list[Pair]:
-    """Rows of F-CT with the row of CT before each: the same seed and the same low-level controller."""
+    """Pairs of rows, CT and F-CT, with the same seed and the same low-level controller."""
     first = {(row.model_seed, row.controller): row for row in before}
     pairs = [(first.get((row.model_seed, row.controller)), row) for row in after]
     return [(ct, tuned) for ct, tuned in pairs if ct is not None]

@@ -42,7 +42,7 @@ class Options:
     height: int = 270
     """Height of the picture [pixels]."""
     speed: int = 4
-    """How many times as fast as the robot."""
+    """Speed of the film relative to real time."""
 
 
 def frames_of(video: Path, n: int) -> Iterator[Image.Image]:
@@ -56,7 +56,7 @@ def frames_of(video: Path, n: int) -> Iterator[Image.Image]:
 
 
 def draw_map(maze: Maze, path: np.ndarray, goal: np.ndarray, height: int) -> Image.Image:
-    """The maze from above with the way so far: positions [n, 2] and goal [2] (m), x to the right and y up."""
+    """The maze from above with the path so far: positions [n, 2] and goal [2] (m), x to the right and y up."""
     walls = unpadded(maze)
     scale = height / (walls.shape[0] * float(maze.cell_m))
     side = scale * float(maze.cell_m)
@@ -74,7 +74,7 @@ def draw_map(maze: Maze, path: np.ndarray, goal: np.ndarray, height: int) -> Ima
 
 
 def main(options: Options) -> None:
-    """Film one episode. Raises UserError where the model does not reach its goal."""
+    """Film one episode. Raises UserError if the model does not reach its goal."""
     if options.out.suffix != ".gif" or not options.out.parent.is_dir():
         raise UserError(f"--out {options.out}: give a .gif file in a folder that exists")
     prepare_jax()
@@ -98,7 +98,7 @@ def main(options: Options) -> None:
         so_far = path[: max(2, round(steps * (i + 1) / len(filmed)))]
         pictures.append(beside(frame, draw_map(maze, so_far, pairs.goal[0], options.height)))
     ms = round(1000 * steps * robot.control_dt_s / len(filmed) / options.speed)
-    durations = [ms] * (len(pictures) - 1) + [2000]  # so that the end is seen
+    durations = [ms] * (len(pictures) - 1) + [2000]  # pause at the end
     pictures[0].save(options.out, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
     print(f"{options.out}: {len(pictures)} pictures, {options.out.stat().st_size / 1e6:.1f} MB")
 

@@ -44,7 +44,7 @@ SWEPT = {"density": "density of obstacles / the published one", "noise": "level 
 
 
 def page(title: str, *parts: str | Sequence[str]) -> str:
-    """A page that is written as a whole, from its paragraphs and tables; empty ones are left out."""
+    """A fully generated page, from its paragraphs and tables; empty ones are left out."""
     texts = [part.strip() if isinstance(part, str) else "\n".join(part) for part in parts]
     return "\n\n".join([f"# {title}", WRITTEN, *filter(None, texts)]) + "\n"
 
@@ -165,7 +165,7 @@ which is the better start's after the last update.
 
 
 def transfer_page(rows: Sequence[TransferRow]) -> str:
-    """What a trunk is worth to another robot."""
+    """The page about transfer to another robot."""
     picture = (
         "![Success in the unseen maze against updates, from scratch and from the other robot's trunk](transfer.png)"
     )
@@ -207,7 +207,7 @@ def load_results() -> dict[str, Results]:
 
 
 def load_controllers() -> list[dict[str, Any]]:
-    """What the shipped controllers say of themselves."""
+    """The descriptions (``controller.json``) of the shipped controllers."""
     return [json.loads(file.read_text("utf-8")) for file in sorted(ZOO.glob("controllers/*/controller.json"))]
 
 
@@ -232,7 +232,7 @@ def pages() -> dict[Path, str]:
 
 
 def filled(file: Path, tables: Mapping[str, Sequence[str]]) -> dict[Path, str]:
-    """A page that people write, with its tables between their markers."""
+    """A hand-written page, with new tables between its markers."""
     text = file.read_text("utf-8")
     for name, lines in tables.items():
         text = put(text, name, lines)
@@ -240,7 +240,7 @@ def filled(file: Path, tables: Mapping[str, Sequence[str]]) -> dict[Path, str]:
 
 
 def plots() -> dict[Path, Callable[[], None]]:
-    """What draws each plot, by file."""
+    """Functions that draw the plots, by file."""
     found = load_results()["turtlebot3-cpu"]
     drawn: dict[Path, Callable[[], None]] = {}
     for axis, label in SWEPT.items():

@@ -10,21 +10,21 @@ from intervals import rate_of
 from matplotlib.figure import Figure
 from rows import CT, Row, TransferRow
 
-HELD_OUT_ENOUGH = 0.97  # of the held-out edges
+HELD_OUT_ENOUGH = 0.97  # success on held-out edges that counts as good
 
 
 def line_of(row: Row) -> str:
-    """The model or reference to which a row of the rooms belongs."""
+    """The variant or reference of a Turtlebot3 row."""
     return row.variant if row.method == CT else row.method
 
 
 def start_of(row: TransferRow) -> str:
-    """What a curve of the transfer began with, in words."""
+    """The start of a transfer curve, in words."""
     return "from scratch" if row.source is None else f"from the trunk of the {row.start}'s {row.source}"
 
 
 def minutes(controller: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """Success on held-out edges by time [min]: every iteration takes as long as any other."""
+    """Success on held-out edges by time [min]. All iterations take the same time."""
     made = controller["made"]
     whole = controller["sac"]["iterations"]
     return [(made["wall_s"] / 60 * step / whole, rate) for step, rate in made.get("curve", ())]
@@ -37,7 +37,7 @@ def draw_sweep(rows: Sequence[Row], axis: str, label: str, file: Path) -> None:
     lines: dict[str, dict[float, list[Row]]] = {}
     for row in rows:
         lines.setdefault(line_of(row), {}).setdefault(getattr(row, axis), []).append(row)
-    apart = 0.008 * np.ptp([getattr(row, axis) for row in rows])  # so that no interval hides another
+    apart = 0.008 * np.ptp([getattr(row, axis) for row in rows])  # shift the points so that intervals do not overlap
     lowest = 100.0
     for i, (name, points) in enumerate(lines.items()):
         x = np.array(sorted(points))

@@ -4,7 +4,7 @@
 
 With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
 published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without (``cpu-ct``) and with fine-tuning
-(``cpu``). A planner and an explorer stand beside them. All methods meet the same 100 start-goal pairs. ``zoo:point``
+(``cpu``). Planner and explorer are the references. All methods have the same 100 start-goal pairs. ``zoo:point``
 is ``mazes-ct``. Writes ``experiments/results/point-PRESET.json``.
 """
 
@@ -12,17 +12,17 @@ from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_conf
 
 BC = {"model.returns": False}
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 20, "round_fit": half_the_updates}
-# Without fine-tuning: the updates of the last training at once, its timesteps shifted at random.
+# Without fine-tuning: all updates of the last training at once, with timesteps shifted at random.
 CT = {"rounds": 0, "fit.updates": 2500, "fit.warmup": 20, "fit.decay": True, "fit.shift_timestep": 300}
 LONG_CT = CT | {"fit.updates": 5000}
 LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
 MODES_CT = CT | {"model.modes": 4}
-MODES = {"model.modes": 4, "model.commitment": 3.0}  # Only who has learned from failures keeps to a mode.
-CALM = {"controller_effort": 0.75}  # of the controller's range
-MEMORY = {"model.stride": 3}  # as many steps remembered, farther apart
-SKILL = {"model.skill": True}  # the head is the low-level controller, as it was learned
-ROAM = {"recover.random_mazes": 100}  # CT of the one maze, which looks for its failures in others
-# Trajectories and recoveries of 100 random mazes besides; CT and F-CT after as many updates in all.
+MODES = {"model.modes": 4, "model.commitment": 3.0}  # Commitment only for models that learned from failures.
+CALM = {"controller_effort": 0.75}  # share of the controller's range
+MEMORY = {"model.stride": 3}  # the same number of steps in memory, farther apart
+SKILL = {"model.skill": True}  # the action head is the fixed low-level controller
+ROAM = {"recover.random_mazes": 100}  # CT trained in one maze; recoveries also from random mazes
+# Also trajectories and recoveries from 100 random mazes. CT and F-CT have the same total number of updates.
 MAZES = {
     "random_mazes": 100, "collect.trajectories": 2500, "collect.reset_interval": 10, "rounds": 6,
     "fit.updates": 600, "fit.shift_timestep": 300, "round_fit.updates": 200, "round_fit.shift_timestep": 300,
@@ -30,7 +30,7 @@ MAZES = {
 }  # fmt: skip
 MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
 
-SHIPPED = "mazes-ct"  # the variant that zoo:point is
+SHIPPED = "mazes-ct"  # the variant of zoo:point
 
 VARIANTS = {
     "published": Variant("published", label="CT"),

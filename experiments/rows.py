@@ -1,4 +1,4 @@
-"""What the experiments measure: typed rows, and the files in ``experiments/results`` that hold them."""
+"""The results of the experiments: typed rows, and the files in ``experiments/results`` that hold them."""
 
 import sys
 from collections.abc import Iterable, Mapping
@@ -14,12 +14,12 @@ from ct_jax.checkpoint import read_json, write_json
 from ct_jax.evaluate import GUIDED
 
 RESULTS = Path(__file__).parent / "results"
-CT = "ct"  # the method of a row that a transformer made
+CT = "ct"  # the method of all rows of transformers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """What made a row."""
+    """The origin of a row."""
 
     command: str
     commit: str
@@ -29,7 +29,7 @@ class Origin:
 
     @classmethod
     def read(cls, values: Mapping[str, Any]) -> Self:
-        """The row that ``values`` gave, or what ``provenance`` or a run's ``config.json`` says of its origin.
+        """Read a row from JSON, or the origin from ``provenance`` or a run's ``config.json``.
 
         Raises:
             UserError: a key is missing.
@@ -42,13 +42,13 @@ class Origin:
             raise UserError(f"not a row of results ({bad}); measure it again") from None
 
     def values(self) -> dict[str, Any]:
-        """The row as JSON holds it: flat, without what is None."""
+        """The row as flat JSON, without values that are None."""
         own = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "more"}
         return {name: value for name, value in own.items() if value is not None} | dict(self.more)
 
 
 def origin_of(made: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys of ``Origin`` alone, of a run's ``config.json`` or of ``provenance``."""
+    """The keys of ``Origin``, from a run's ``config.json`` or from ``provenance``."""
     return {name: made[name] for name in ("command", "commit", "hardware", "created")}
 
 
@@ -70,11 +70,11 @@ class Scored(Origin):
     outcomes: Mapping[str, str] | None = None  # episode by episode as ones and zeros: "success", "collision", ...
 
     def rate(self, name: str) -> float:
-        """The rate of that name: success, collision, fall, frontal or grazing."""
+        """The rate with this name: success, collision, fall, frontal or grazing."""
         return getattr(self, f"{name}_rate") or 0.0
 
     def flags(self, name: str) -> np.ndarray:
-        """What the rate of that name counts, 0 or 1 [episodes]."""
+        """The outcome of each episode for the rate with this name, 0 or 1 [episodes]."""
         assert self.outcomes is not None
         return np.array([int(digit) for digit in self.outcomes[name]])
 
@@ -89,8 +89,8 @@ class Made(Origin):
     settings: str | None = None  # digest
     controller: str | None = None  # digest of the low-level controller
     run_wall_s: float = 0.0  # all stages of the run
-    collect_wall_s: float = 0.0  # of them, the planning trajectories
-    learn_wall_s: float | None = None  # of them, the baseline
+    collect_wall_s: float = 0.0  # collecting the planning trajectories
+    learn_wall_s: float | None = None  # training the baseline
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ class Row(Made, Scored):
     """One method of one model, in one maze or in the rooms of one density and noise."""
 
     seen: bool | None = None  # the model was trained in this maze
-    margin_m: float | None = None  # references: what their roadmap keeps off walls
+    margin_m: float | None = None  # references: clearance of their roadmap beyond the robot's radius
     effort: float | None = None  # references: share of the actuators' range that the controller uses
     worlds: int | None = None  # rooms
     pairs: int | None = None  # in each room
@@ -107,19 +107,19 @@ class Row(Made, Scored):
     full: int | None = None  # seven pairs: arrived and touched nothing
     partial: int | None = None  # seven pairs: arrived and grazed something
     failed: int | None = None  # seven pairs: the rest
-    trained: Mapping[str, Any] | None = None  # origin of the model, where the row says what measured it
+    trained: Mapping[str, Any] | None = None  # origin of the model, if the row's origin is that of a later evaluation
 
     @property
     def subject(self) -> tuple[Any, ...]:
-        """What a row is of: a later row of the same subject replaces it. References belong to no model."""
+        """The key of a row: a later row with the same key replaces it. References belong to no model."""
         model = () if self.method in GUIDED else (self.variant, self.model_seed)
-        # Rows of early commits name no margin, and had none.
+        # Rows of early commits have no ``margin_m``; their margin was 0.
         return (*model, self.method, self.maze, self.density, self.noise, self.margin_m or 0.0, self.effort)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unmade(Made):
-    """A row that there is not, and why."""
+    """A row that could not be made, and the reason."""
 
     why: str
 
@@ -138,9 +138,9 @@ class CqlRow(Scored):
 
 @dataclass(frozen=True, kw_only=True)
 class TransferRow(Scored):
-    """A transformer after some updates, begun from scratch or from the trunk of another robot's model."""
+    """A transformer after some updates, started from scratch or from the trunk of another robot's model."""
 
-    run: str  # whose planning trajectories it learns from
+    run: str  # the run whose planning trajectories it learns from
     start: str  # "scratch", or the other robot
     source: str | None = None  # the other robot's run
     updates: int
@@ -151,7 +151,7 @@ Kind = TypeVar("Kind", bound=Origin)
 
 @dataclass
 class Results:
-    """A results file of a robot: rows of several commands side by side."""
+    """A robot's results file: rows of several commands."""
 
     rows: list[Row] = field(default_factory=list)
     density: list[Row] = field(default_factory=list)  # rooms of other densities
@@ -161,7 +161,7 @@ class Results:
 
     @staticmethod
     def read(file: Path) -> "Results":
-        """The results in a file; none where it is not there."""
+        """The results in a file; empty if the file does not exist."""
         found = read_json(file) if file.is_file() else {}
         rows = {name: [Row.read(each) for each in found.get(name, ())] for name in LISTS}
         return Results(**rows, unmade=[Unmade.read(each) for each in found.get("unmade", ())])
@@ -177,10 +177,10 @@ LISTS = ("rows", "density", "noise", "seven")
 
 
 def add_results(file: Path, found: Results) -> None:
-    """Add results to a file. What was measured by other commands stays, unless it is measured again or its variant
-    has other settings now; the latter is said on stderr.
+    """Add results to a file. Rows of other commands are kept, with two exceptions: rows that are measured again, and
+    rows whose variant now has other settings. The latter are reported on stderr.
 
-    A reason why a row is missing goes when the row is there.
+    The reason for a missing row is removed once the row exists.
     """
     kept, now = Results.read(file), {}
     for name in LISTS:
@@ -203,7 +203,7 @@ def add_results(file: Path, found: Results) -> None:
 
 
 def replace_rows(file: Path, rows: Iterable[Kind], names: tuple[str, ...], kind: type[Kind]) -> list[Kind]:
-    """Write rows into a file in place of those that agree with one in all these names; returns all of it."""
+    """Write rows to a file. They replace rows that have the same values of ``names``. Returns all rows of the file."""
     rows = list(rows)
     subject = lambda row: tuple(getattr(row, name) for name in names)  # noqa: E731
     again = set(map(subject, rows))
@@ -214,5 +214,5 @@ def replace_rows(file: Path, rows: Iterable[Kind], names: tuple[str, ...], kind:
 
 
 def read_rows(file: Path, kind: type[Kind]) -> list[Kind]:
-    """The rows of a file that has one list; none where it is not there."""
+    """The rows of a file with one list; empty if the file does not exist."""
     return [kind.read(each) for each in read_json(file)["rows"]] if file.is_file() else []

@@ -1,7 +1,7 @@
-"""Runs a robot's variants: each a preset with plain overrides, trained and evaluated with each seed.
+"""Runs a robot's variants. A variant is a preset with plain overrides; it is trained and evaluated with each seed.
 
-A run that is finished is taken as it is; one that was interrupted goes on. Runs share the stages that come out alike:
-a stage is known by the digest of its inputs.
+A finished run is used as it is; an interrupted run continues. Runs share stages with the same inputs, which are
+compared by their digests.
 """
 
 import functools
@@ -48,7 +48,7 @@ from ct_jax.run import (
     training,
 )
 
-SAC_ALONE_ITERATIONS = 8000  # of the point: 500 whole episodes
+SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
 
 
 # -------------------------------------------------------------------------------------------------------- variants
@@ -56,20 +56,20 @@ SAC_ALONE_ITERATIONS = 8000  # of the point: 500 whole episodes
 
 @dataclass(frozen=True)
 class Variant:
-    """A row of a robot's table: a preset, and what is different."""
+    """A row of a robot's table: a preset and its changes."""
 
     preset: str
-    """"published" (at the size that --preset names) or "cpu"."""
+    """"published" (at the size given by --preset) or "cpu"."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Settings by dotted name, such as "model.modes"; a function gives the value from the preset."""
+    """Settings by dotted name, such as "model.modes"; a value can be a function of the preset."""
     label: str = ""
-    """What tables call it (default: CT or F-CT with the variant's name)."""
+    """Name in tables (default: CT or F-CT with the variant's name)."""
     tuned_from: str | None = None
-    """Of a fine-tuned variant: the variant that it was before."""
+    """For a fine-tuned variant: the variant before fine-tuning."""
     baseline: CqlConfig | SacConfig | None = None
-    """What is learned from the run's data, or instead of it, in place of a transformer."""
+    """The baseline that is trained in place of a transformer: CQL on the run's data, or SAC without data."""
     sweeps: tuple[str, ...] = ()
-    """Turtlebot3: what else it meets: "density", "noise", "seven"."""
+    """Turtlebot3: further evaluations: "density", "noise", "seven"."""
 
     def settings(self, robot: str, preset: str = "cpu") -> Settings:
         """The settings of its runs, with ``--preset preset``."""
@@ -82,13 +82,13 @@ class Variant:
 
 
 def _set(config: Any, path: list[str], value: Any) -> Any:
-    """A frozen dataclass with another value at a path of field names."""
+    """A copy of a frozen dataclass with another value at a path of field names."""
     name, *below = path
     return replace(config, **{name: _set(getattr(config, name), below, value) if below else value})
 
 
 def half_the_updates(published: Settings) -> Any:
-    """The training after fine-tuning as published, whose length the paper does not give: half of the first one."""
+    """The training after fine-tuning as published: half of the first training. The paper does not give its length."""
     return replace(published.fit, updates=published.fit.updates // 2, warmup=20)
 
 
@@ -98,14 +98,14 @@ def pt_cql_config(frame: str = "world") -> CqlConfig:
 
 
 def sac_alone_config(robot: str) -> SacConfig:
-    """SAC alone: the controller's learner with the maze as its task: longer ways need a longer view."""
+    """SAC alone: the controller's learner in the whole maze. Longer paths need a larger discount factor."""
     sac = get_preset("cpu", robot).sac
     changes = {"discount": 0.99, "iterations": SAC_ALONE_ITERATIONS, "reward_scale": 0.1, "alive_bonus": 0.0}
     return replace(sac, **changes, **EDGES_ONLY)
 
 
 def load_variants(robot: str) -> dict[str, Variant]:
-    """The variants that a robot's file holds. Raises UserError for a robot without one."""
+    """The variants in a robot's file. Raises UserError for a robot without a file."""
     if robot not in ROBOTS:
         raise UserError(f"no experiment for robot '{robot}'; robots: {', '.join(ROBOTS)}")
     return importlib.import_module(robot).VARIANTS
@@ -115,12 +115,12 @@ ROBOTS = ("point", "ant", "humanoid", "turtlebot3")
 
 
 def choose(variants: Mapping[str, Variant], preset: str, names: tuple[str, ...] = ()) -> dict[str, Variant]:
-    """The variants that a preset has, or those of them that are named, each after those whose stages it shares.
+    """The variants of a preset, or only those with the given names, in the order of the robot's file.
 
-    "cpu" has all; "published" and "paper" have the published ones, at their size; "demo" is one of its own.
+    "cpu" has all variants; "published" and "paper" have the published ones, at their size; "demo" has only itself.
 
     Raises:
-        UserError: a variant that the preset does not have.
+        UserError: the preset has no variant with a given name.
     """
     known = dict(variants)
     if preset == "demo":
@@ -145,9 +145,9 @@ class Options:
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trained models."""
     variants: tuple[str, ...] = ()
-    """Rows to run (default: all that the preset has)."""
+    """Variants to run (default: all of the preset)."""
     out: Path | None = None
-    """Folder of the runs (default: runs/ROBOT); what is finished there is not run again."""
+    """Folder of the runs (default: runs/ROBOT); finished runs are not repeated."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class MazeOptions(Options):
 
 
 def about(docstring: str | None, variants: Mapping[str, Variant]) -> str:
-    """What --help says of an experiment."""
+    """The --help text of an experiment."""
     return f"{docstring}\nvariants: {', '.join(variants)}"
 
 
@@ -212,16 +212,16 @@ class Study:
         )  # fmt: skip
 
     def run(self, variants: Mapping[str, Variant], seeds: tuple[int, ...], keep: Callable[[Results], None]) -> Results:
-        """Train and evaluate all variants with each seed; a failure of one stops no other.
+        """Train and evaluate all variants with each seed. If one fails, the others still run.
 
-        F-CT that finds nothing to learn from is a result, too: its reason is kept instead of a row. Planner and
-        explorer appear once for each roadmap margin and each effort.
+        If F-CT finds no recoveries to learn from, that is a result too: its reason is kept instead of a row. Planner
+        and explorer appear once for each roadmap margin and each effort.
 
         Args:
-            keep: called with all results so far after each model.
+            keep: called after each model with all results so far.
 
         Raises:
-            UserError: after all others have run: the runs that could not be finished.
+            UserError: at the end, if some runs failed; it names them.
         """
         prepare_jax()
         found, failed = Results(), []
@@ -238,7 +238,7 @@ class Study:
                     found.unmade.append(Unmade(**made_of(run, name, CT), why=str(none)))
                     keep(found)
                     continue
-                except UserError as bad:  # the others may yet come out
+                except UserError as bad:  # the other runs can still succeed
                     print(f"{run.folder}: {bad}", file=sys.stderr)
                     failed.append(f"{run.folder}: {bad}")
                     continue
@@ -253,7 +253,7 @@ class Study:
 
 
 def measure(run: Run, name: str, variant: Variant) -> list[Row]:
-    """The rows of a run, which is trained or learned unless it is finished."""
+    """The rows of a run. It is trained first unless it is finished."""
     if variant.baseline is not None:
         found = BASELINES[type(variant.baseline)](run, variant.baseline)
     else:
@@ -263,7 +263,7 @@ def measure(run: Run, name: str, variant: Variant) -> list[Row]:
 
 
 def reference(run: Run) -> dict[str, float]:
-    """What tells the planner and the explorer of a run from those of other runs; in rooms they never differ."""
+    """The settings by which planner and explorer differ between runs. In rooms there are none."""
     settings = run.settings
     if settings.rooms:
         return {}
@@ -283,7 +283,7 @@ _REFERENCES = ("episodes", "pairs_seed", "controller_effort")
 
 
 def stage_digests(run: Run) -> dict[str, str]:
-    """Digests of the inputs of each stage that runs may share; "evaluate" is that of planner and explorer."""
+    """Digests of the inputs of each stage that runs can share; "evaluate" is for planner and explorer only."""
     found = identity(run)
     settings: dict[str, Any] = found["settings"]
     where = {name: found[name] for name in ("robot", "mazes", "eval_mazes", "engine")}
@@ -293,7 +293,7 @@ def stage_digests(run: Run) -> dict[str, str]:
         inputs |= {name: settings.get(name) for name in names}
         digests[stage] = digest_words(inputs)
     asked = {name: settings.get(name) for name in _REFERENCES}
-    if run.settings.rooms:  # where they have a roadmap and a controller of their own
+    if run.settings.rooms:  # there, planner and explorer have their own roadmap and controller
         asked = {name: asked[name] for name in ("episodes", "pairs_seed")} | {"worlds": run.settings.rooms.worlds}
     else:
         asked["controller"] = digests["controller"]
@@ -302,7 +302,7 @@ def stage_digests(run: Run) -> dict[str, str]:
 
 
 def share(runs: list[Run], run: Run) -> None:
-    """Copy the finished stages of other runs whose inputs are the same, with the episodes of planner and explorer."""
+    """Copy finished stages with the same inputs from other runs, and the episodes of planner and explorer."""
     wanted = stage_digests(run)
     with open_run(run, resume=True):
         for source in runs:
@@ -318,7 +318,7 @@ def share(runs: list[Run], run: Run) -> None:
 
 def _copy_references(source: Path, folder: Path) -> None:
     folder.mkdir()
-    for ending in ("npz", "json"):  # of each row the JSON file comes last: it says that the row is whole
+    for ending in ("npz", "json"):  # the JSON file comes last: it shows that the row is complete
         for method in GUIDED:
             for file in source.glob(f"*-{method}.{ending}"):
                 shutil.copy(file, folder)
@@ -328,7 +328,7 @@ def _copy_references(source: Path, folder: Path) -> None:
 
 
 def label(run: Run, variant: str, values: dict[str, Any]) -> Row:
-    """A row with what made its model, or, where it says so itself, with what measured it later."""
+    """A row with the origin of its model, or with its own origin if ``values`` has one."""
     made = made_of(run, variant, values["method"])
     return Row.read(made | (reference(run) if values["method"] in GUIDED else {}) | values)
 
@@ -339,7 +339,7 @@ def made_of(run: Run, variant: str, method: str) -> dict[str, Any]:
     stages = [*sorted(run.folder.glob("*/done.json")), run.folder / "baselines" / method / "done.json"]
     walls = {done.parent.name: read_json(done)["wall_s"] for done in stages if done.is_file()}
     made = {"variant": variant, "model_seed": run.seed, "method": method, "settings": digest(run.settings)}
-    if not run.settings.rooms and method != "sac":  # which nothing led
+    if not run.settings.rooms and method != "sac":  # SAC alone has no low-level controller
         made["controller"] = controller_digest(str(run.folder), run.robot)
     made |= {"run_wall_s": round(sum(walls.values())), "collect_wall_s": round(walls.get("collect", 0.0))}
     if method in walls:
@@ -349,17 +349,17 @@ def made_of(run: Run, variant: str, method: str) -> dict[str, Any]:
 
 @functools.cache  # every row of a run needs it
 def controller_digest(where: str, robot: str) -> str:
-    """Letters that tell low-level controllers apart, each of a run's folder."""
+    """A digest of the low-level controller in a run's folder."""
     return digest_arrays(load_controller(where, robot)[0])
 
 
 def digest_arrays(tree: Any) -> str:
-    """Letters that tell trees of arrays apart."""
+    """A digest of a tree of arrays."""
     return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree))).hexdigest()[:12]
 
 
 def digest_words(*values: Any) -> str:
-    """Letters that tell values apart that JSON can hold."""
+    """A digest of values that JSON can hold."""
     words = "".join(json.dumps(value, sort_keys=True) for value in values)
     return hashlib.sha256(words.encode()).hexdigest()[:12]
 
@@ -442,7 +442,7 @@ BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: 
 def baseline(
     run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
 ) -> list[dict[str, Any]]:
-    """Rows of one baseline, learned unless its weights are there."""
+    """Rows of one baseline. It is trained first unless its weights exist."""
     frame, stage = config.frame, f"baselines/{name}"
     folder = run.folder / stage
     env = run.env(auto_reset=False)

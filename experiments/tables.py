@@ -39,7 +39,7 @@ def grid(names: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
 
 
 def put(text: str, name: str, lines: Sequence[str]) -> str:
-    """The text with these lines between its markers of that name."""
+    """The text with these lines between the markers called ``name``."""
     marked = re.compile(rf"(<!-- {re.escape(name)} -->\n).*?(<!-- /{re.escape(name)} -->)", re.DOTALL)
     if not marked.search(text):
         print(f"no place for the table {name}", file=sys.stderr)
@@ -49,10 +49,10 @@ def put(text: str, name: str, lines: Sequence[str]) -> str:
 def made_by(
     rows: Sequence[Origin], names: Sequence[str] = (), cells: Callable[[Any], tuple[str, ...]] = lambda row: ()
 ) -> list[str]:
-    """The command, commit, machine and day of rows, one line for each that differs.
+    """The command, commit, machine and date of rows, without repeated lines.
 
     Args:
-        names: of columns before them, whose cells ``cells`` gives.
+        names: the names of further columns on the left; ``cells`` gives their cells.
     """
     found = dict.fromkeys((*cells(row), *_origin(row)) for row in rows)
     return grid([*names, "command", "commit", "machine", "date"], found)
@@ -63,7 +63,7 @@ def _origin(row: Origin) -> tuple[str, ...]:
 
 
 def each_model(rows: Sequence[Row]) -> str:
-    """Success of each model in percent, by seed; nothing for a reference."""
+    """Success of each model in percent, by seed; empty for a reference."""
     if rows[0].method in GUIDED:
         return ""
     return ", ".join(f"{round(100 * row.success_rate, 1):g}" for row in sorted(rows, key=lambda row: row.model_seed))
@@ -73,7 +73,7 @@ def each_model(rows: Sequence[Row]) -> str:
 
 
 def method_name(row: Row | Unmade, variants: Mapping[str, Variant]) -> str:
-    """What tables call a row: the paper's name of the method, the variant's name, or the reference with its setting."""
+    """The name of a row in tables: the paper's name, the variant's name, or the reference with its settings."""
     if isinstance(row, Row) and row.method in GUIDED:
         margin = f", {row.margin_m:g} m margin" if row.margin_m else ""
         return f"{row.method}{margin}" + (f", {row.effort:.0%} effort" if row.effort is not None else "")
@@ -81,7 +81,7 @@ def method_name(row: Row | Unmade, variants: Mapping[str, Variant]) -> str:
 
 
 def label_of(name: str, variants: Mapping[str, Variant]) -> str:
-    """What tables call a variant."""
+    """The name of a variant in tables."""
     variant = variants.get(name)
     if variant and variant.label:
         return variant.label
@@ -89,7 +89,7 @@ def label_of(name: str, variants: Mapping[str, Variant]) -> str:
 
 
 def by_method(rows: Iterable[Row], variants: Mapping[str, Variant]) -> dict[tuple[str, str], list[Row]]:
-    """The rows of each maze and method, its models together: seen mazes first, variants as the robot's file has them,
+    """The rows of all models, by maze and method: seen mazes first, variants in the order of the robot's file,
     references last."""
     order = list(variants)
 
@@ -133,14 +133,14 @@ def differences(results: Results, variants: Mapping[str, Variant]) -> list[str]:
 
 
 def reasons(unmade: Sequence[Unmade], variants: Mapping[str, Variant]) -> list[str]:
-    """Why methods have no row."""
+    """The reasons for missing rows."""
     ordered = sorted(unmade, key=lambda row: (row.variant, row.model_seed))
     body = [[method_name(row, variants), str(row.model_seed), row.why, *_origin(row)] for row in ordered]
     return grid(["no row of", "seed", "reason", "command", "commit", "machine", "date"], body) if body else []
 
 
 def runs_table(rows: Sequence[Row], variants: Mapping[str, Variant]) -> list[str]:
-    """What made each variant: seeds, minutes, command, commit, machine and day."""
+    """The origin of each variant: seeds, minutes, command, commit, machine and date."""
     order = list(variants)
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in sorted(rows, key=lambda row: order.index(row.variant) if row.variant in order else len(order)):
@@ -154,7 +154,7 @@ def runs_table(rows: Sequence[Row], variants: Mapping[str, Variant]) -> list[str
 
 
 def _minutes(rows: Sequence[Row]) -> str:
-    """Minutes of a model, in the mean of its seeds, and of them its trajectories; early baselines were not timed."""
+    """Mean minutes for a model, and for collecting its trajectories. Early baselines were not timed."""
     timed = [row for row in rows if row.method == CT or row.learn_wall_s is not None]
     if not timed:
         return ""
@@ -168,10 +168,10 @@ def _minutes(rows: Sequence[Row]) -> str:
 
 
 def summary_table(results: Mapping[str, Results]) -> list[str]:
-    """One line for each robot and maze: the paper's CT, ours, and the planner that knows the map; success alone.
+    """One line for each robot and maze: success of the paper's CT, our CT, and the planner that knows the map.
 
     Args:
-        results: by the files' names.
+        results: by file name, without suffix.
     """
     names = ["robot", "maze", "CT, paper", "CT as published, small model", "CT as published, the paper's size"]
     names += ["CT, lifted", "F-CT, lifted", "planner with the map"]
@@ -183,7 +183,7 @@ def summary_table(results: Mapping[str, Results]) -> list[str]:
                 [row for row in results.get(f"{robot}-{size}", Results()).rows if row.maze == maze]
                 for size in ("cpu", "paper")
             )
-            # "ct" is the Turtlebot3's, whose model is no larger in the paper.
+            # "ct" is the Turtlebot3's: its model has the paper's size in every preset.
             of = [_models(rows, "published"), _models(full, "published") + _models(rows, "ct")]
             cells = [_together(models) for models in (*of, _models(rows, ct), _models(rows, tuned))]
             planners = sorted((row for row in rows if row.method == "planner"), key=lambda row: row.variant != ct)
@@ -200,7 +200,7 @@ def _models(rows: Iterable[Row], variant: str) -> list[Row]:
 
 
 def _together(rows: Sequence[Row]) -> str:
-    """Success of models together with its interval [%], and how many they are; of a reference alone."""
+    """Success [%] of all models with its interval, and the number of models; no number for a reference."""
     if not rows:
         return "not measured"
     return pooled(rows, "success") + ("" if rows[0].method in GUIDED else f", n = {len(rows)}")
@@ -210,7 +210,7 @@ def _together(rows: Sequence[Row]) -> str:
 
 
 def room_tables(results: Results, heading: str = "##") -> list[str]:
-    """One line for each variant and reference, its models together; then densities, levels of noise, seven pairs."""
+    """One line for each variant and reference; then tables of densities, levels of noise, and the seven pairs."""
     names = ["model", "density", "noise", "success %", "each model", "SPL", "frontal %", "grazing %"]
     lines: list[str] = []
     parts = {"The published rooms": results.rows, "Other densities": results.density, "Noise": results.noise}
@@ -245,10 +245,10 @@ def _with_seed(row: Row) -> str:
 
 
 def transfer_table(rows: Sequence[TransferRow]) -> list[str]:
-    """One line for each robot, run and start: success after so many updates, and when 90 % of the final one was there.
+    """One line for each robot, run and start: success by number of updates, and the updates to 90 % of the final value.
 
-    The final success is the better of both starts' means after the last update. Between two numbers of updates success
-    is taken to grow with their logarithm.
+    The final success is the better of both starts' means after the last update. Between two measurements, success is
+    interpolated over the logarithm of the updates.
     """
     marks = sorted({row.updates for row in rows})
     names = ["robot", "run", "start", "seeds", *(f"{mark}" for mark in marks), "90 % of the final at"]
@@ -267,7 +267,7 @@ def transfer_table(rows: Sequence[TransferRow]) -> list[str]:
 
 
 def _reached(marks: list[int], curve: list[float], enough: float) -> str:
-    """After how many updates a curve had so much, interpolated between the marks."""
+    """The number of updates after which a curve reached ``enough``, interpolated between the marks."""
     at = next((i for i, mean in enumerate(curve) if mean >= enough), None)
     if not at:
         return "later" if at is None else f"at most {marks[0]}"
@@ -277,9 +277,9 @@ def _reached(marks: list[int], curve: list[float], enough: float) -> str:
 
 
 def finetuned_table(rows: Sequence[Row], variants_of: Callable[[str], Mapping[str, Variant]]) -> list[str]:
-    """One line for each robot, F-CT, CT and maze: CT, F-CT and F-CT − CT, of the models of all seeds.
+    """One line for each robot, F-CT, CT and maze: success of CT and F-CT, and F-CT − CT, over all seeds.
 
-    CT is the variant before fine-tuning and, where there is one with the same data, that with as many updates.
+    CT is the variant before fine-tuning; a second line has CT with as many updates as F-CT, if it was measured.
     """
     names = ["robot", "F-CT", "CT", "maze", "models", "pairs", "CT %", "F-CT %", "F-CT − CT (percentage points)"]
     subject = lambda row: (row.robot, row.variant, row.maze, row.episodes)  # noqa: E731
@@ -326,7 +326,7 @@ def controllers_table(controllers: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def benchmark_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One line for each figure of a benchmark, and what made them."""
+    """One line for each number of a benchmark, and their origin."""
     body = []
     for row in rows:
         ratio, other = row["ratio"], row["other"]
@@ -363,7 +363,7 @@ def model_card(robot: str, results: Results) -> dict[str, list[str]]:
     led = (settings["prm"]["margin_m"], settings.get("controller_effort"))
 
     def beside(row: Row) -> bool:
-        """The model itself, or a reference with its margin and effort."""
+        """Whether a row is the shipped model's, or a reference's with the same margin and effort."""
         if row.method in GUIDED:
             return robot == "turtlebot3" or (row.margin_m, row.effort) == led
         return (row.variant, row.model_seed, row.method) == (shipped, seed, CT)
@@ -403,7 +403,7 @@ def _facts(model: Mapping[str, Any], robot: str, shipped: str) -> list[str]:
 
 
 def parameters(weights: Path) -> int:
-    """How many numbers a safetensors file holds, by its header."""
+    """The number of parameters in a safetensors file, from its header."""
     with weights.open("rb") as file:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     return sum(int(np.prod(entry["shape"])) for name, entry in header.items() if name != "__metadata__")

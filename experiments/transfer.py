@@ -4,8 +4,8 @@
 
 Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
 transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
-robot's model (``ct_jax.transfer``). As training goes on, it is evaluated in the unseen maze. Writes
-``experiments/results/transfer.json``, in which the curves of other runs and seeds stay.
+robot's model (``ct_jax.transfer``). During training it is evaluated in the unseen maze. Writes
+``experiments/results/transfer.json``; the curves of other runs and seeds are kept there.
 """
 
 import functools
@@ -48,11 +48,11 @@ class Options:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the fits."""
     marks: tuple[int, ...] = (50, 100, 200, 400, 800)
-    """After how many updates to evaluate."""
+    """Numbers of updates after which to evaluate."""
     episodes: int = 100
     """Start-goal pairs."""
     out: Path = Path("runs/transfer")
-    """Folder of the curves; what is finished there is not run again."""
+    """Folder of the curves; finished ones are not run again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +63,12 @@ class Target:
     data: Trajectories
     env: MazeEnv
     learner: Fit
-    mazes: Maze  # that the trajectories are in, stacked
-    unseen: tuple[str, Maze]  # the first one of the run's evaluation
+    mazes: Maze  # mazes of the trajectories, stacked
+    unseen: tuple[str, Maze]  # the first unseen maze of the run's evaluation
 
     @staticmethod
     def of(run: Path, updates: int) -> "Target":
-        """The robot of a finished run, with its planning trajectories and its last fit's settings at a steady rate."""
+        """The robot of a finished run, with its trajectories, and its last fit's settings without decay of the rate."""
         model = load_model(str(run))
         settings = model.settings
         config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
@@ -80,7 +80,7 @@ class Target:
             for key in ("mazes", "eval_mazes")
         )
         if not unseen:
-            raise UserError(f"{run}: was evaluated in no maze but its own; train with --eval-maze")
+            raise UserError(f"{run}: has no unseen maze; train with --eval-maze")
         data = storage.load(run / "collect" / "trajectories.npz")
         mazes = stack_mazes([*seen.values(), *random_mazes(settings.random_mazes)])
         return Target(model, data, env, learner, mazes, next(iter(unseen.items())))
@@ -97,7 +97,7 @@ def curve(
         params = transfer(source.policy.params, params)
     robot, (name, maze) = target.env.robot, target.unseen
     pairs = draw_pairs(0, maze, options.episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    # Saved after every chunk, so that each mark goes on from the one before.
+    # Save after every chunk, so that each mark continues from the one before.
     checkpoints = Checkpoints(folder / "checkpoints", every_s=0.0)
     rows, made = [], provenance()
     with Bar(str(folder.relative_to(options.out)), max(options.marks)) as bar:
@@ -133,7 +133,7 @@ def measure(options: Options) -> list[TransferRow]:
                 head["source"] = runs[other].name if source else None
                 folder = options.out / f"{robot}-{runs[robot].name}" / f"{start}-{seed}"
                 models = [make(robot).model, *([source] if source else [])]
-                # A fit goes on from the mark before: another mark among them would find a later one's weights.
+                # A fit continues from the mark before. With a new mark in between it would start from later weights.
                 of = {
                     "models": [digest_arrays(model.policy.params) for model in models],
                     "episodes": options.episodes, "marks": sorted(options.marks),

@@ -1,17 +1,17 @@
-"""The paper's experiment for the Turtlebot3: cluttered rooms in PyBullet, 20 random ones with 25 pairs each.
+"""The paper's experiment for the Turtlebot3: 20 random cluttered rooms in PyBullet, with 25 pairs in each.
 
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
-With each seed: CT, BC-CT and F-CT as published on the same 1000 planning trajectories; the lifted method with
-fine-tuning (``cpu``) and without (``cpu-ct``); the latter conditioned on all of the predicted return (``cpu-ct-v``) or
-with its past actions as inputs (``cpu-ct-actions``); both trained with noise (``noise``, ``noise-ct``); ``cpu`` trained
-in rooms of many densities (``dense``); and planner and explorer.
+With each seed it trains and evaluates: CT, BC-CT and F-CT as published, on the same 1000 planning trajectories; the
+lifted method with fine-tuning (``cpu``) and without (``cpu-ct``); the latter conditioned on the full predicted return
+(``cpu-ct-v``), or with past actions as inputs (``cpu-ct-actions``); both trained with noise (``noise``, ``noise-ct``);
+and ``cpu`` trained in rooms of many densities (``dense``). Planner and explorer are evaluated too.
 
-Some variants of the first seed then meet rooms of 0.5 to 2 times the published density, sensors and motion with 0 to 2
-times the errors of a real robot, and the paper's seven pairs in one fixed room.
+Some variants of the first seed are then evaluated in rooms with 0.5 to 2 times the published density, with 0 to 2 times
+the errors of a real robot, and on the paper's seven pairs in one fixed room.
 
-The same command continues an interrupted run. Writes ``experiments/results/turtlebot3-PRESET.json``, in which the rows
-of other seeds and variants stay.
+The same command continues an interrupted run. Writes ``experiments/results/turtlebot3-PRESET.json``; the rows of other
+seeds and variants are kept there.
 """
 
 import functools
@@ -30,8 +30,8 @@ from ct_jax.model import TrainedModel, load_model
 from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 from ct_jax.run import Run
 
-DENSITIES = (0.5, 1.5, 2.0)  # besides 1, in which every variant is measured
-LEVELS = (0.5, 1.0, 2.0)  # besides 0
+DENSITIES = (0.5, 1.5, 2.0)  # besides 1, at which every variant is measured
+LEVELS = (0.5, 1.0, 2.0)  # besides 0, at which every variant is measured
 SEVEN_LEVELS = (0.0, 1.0)
 SWEEPS = LISTS[1:]
 SWEPT_PAIRS = 10  # in each room of a sweep
@@ -41,7 +41,7 @@ LIFTED_CT = {"rounds": 0, "optimism": 0.5, "fit.shift_timestep": 300}
 NOISE = {"rooms.noise": 1.0}  # the errors of a real robot, in training
 DENSE = {"rooms.density": min(DENSITIES), "rooms.densest": max(DENSITIES)}
 
-SHIPPED = "cpu"  # the variant that zoo:turtlebot3 is
+SHIPPED = "cpu"  # the variant of zoo:turtlebot3
 
 VARIANTS = {
     "ct": Variant("published", {"rounds": 0}),
@@ -62,13 +62,13 @@ class RoomOptions(Options):
     """What to run in rooms."""
 
     out: Path = Path("runs/turtlebot3")
-    """Folder of the runs; what is finished there is not run again."""
+    """Folder of the runs; finished runs are not repeated."""
     sweeps: bool = True
-    """Also other densities, levels of noise, and the seven pairs."""
+    """Also measure other densities, levels of noise, and the seven pairs."""
 
 
 def run_all(options: RoomOptions) -> Path:
-    """Train and evaluate everything with each seed, continuing what is there; returns the results file."""
+    """Train and evaluate everything with each seed, and continue unfinished runs; returns the results file."""
     file = RESULTS / f"turtlebot3-{options.preset}.json"
     chosen = choose(VARIANTS, options.preset, options.variants)
     study = Study(robot="turtlebot3", preset=options.preset, out=options.out)
@@ -82,7 +82,7 @@ def run_all(options: RoomOptions) -> Path:
 
 
 def sweep(run: Run, name: str, kinds: tuple[str, ...], *, references: bool) -> Iterator[tuple[str, Row]]:
-    """Rows of those kinds: other densities, levels of noise, and the seven pairs."""
+    """Rows of the given kinds: other densities, levels of noise, and the seven pairs."""
     model, settings = load_model(str(run.folder)), run.settings
     kept, seed = run.folder / "sweeps", settings.pairs_seed
     kept.mkdir(exist_ok=True)

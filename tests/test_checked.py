@@ -116,7 +116,7 @@ WRONG = [
     (SacConfig, {"fall_ramp": (0.5, 0.2)}, "SacConfig.fall_ramp is (0.5, 0.2)"),
     (SacConfig, {"turn_ramp": (0.5, 0.2)}, "SacConfig.turn_ramp"),
     (SacConfig, {"through": True}, "set chain"),
-    (SacConfig, {"replay": 3}, "at least a step of each of envs, 64"),
+    (SacConfig, {"replay": 3}, "at least the number of envs, 64"),
     (SacConfig, {"frame": "body"}, "one of world, heading"),
     (CollectConfig, {"guide": "oracle"}, "one of roadmap, shortcut, explorer"),
     (CollectConfig, {"starts": "corners"}, "CollectConfig.starts is 'corners'; give one of vertices, maze"),

@@ -1,8 +1,8 @@
 """Training the low-level controller with Soft Actor-Critic on the edges of a roadmap (paper, Algorithm 2).
 
-The networks, losses, replay buffer and running statistics are brax's; the loop is ours, because brax's own trainer can
-neither draw fresh goals at a reset nor be resumed. The controller sees proprioception and the vector to its goal, never
-a wall.
+The networks, losses, replay buffer and running statistics are brax's. The loop is ours, because brax's own trainer can
+neither draw fresh goals at a reset nor resume. The controller sees proprioception and the vector to its goal, but no
+walls.
 """
 
 import functools
@@ -32,71 +32,71 @@ from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
 from ct_jax.rollout import Action, Controller, act_as_meant, broke_off, rollout
 
-Metres = Annotated[float, Within(0, 1_000_000)]  # and other prices of a step
+Metres = Annotated[float, Within(0, 1_000_000)]  # also for other terms of the reward
 
 
 @dataclass(frozen=True)
 class SacConfig(Checked):
-    """Soft Actor-Critic (paper, sec. III-G, where it says; otherwise the usual values)."""
+    """Soft Actor-Critic. Values marked "paper" are from sec. III-G; the others are usual values."""
 
     envs: Annotated[int, Within(1, 100_000)] = 64  # environments stepped together
-    iterations: Count = 500  # each: one step of all environments, then the updates
-    updates: Annotated[int, Within(1, 10_000)] = 8  # gradient updates an iteration
+    iterations: Count = 500  # in each: one step of all environments, then the updates
+    updates: Annotated[int, Within(1, 10_000)] = 8  # gradient updates in an iteration
     warmup: Annotated[int, Within(0, 10**9)] = 20  # first iterations, with random actions and no updates
     batch: Annotated[int, Within(1, 1_000_000)] = 256  # paper
     learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # paper
-    final_rate: Share = 1.0  # share of the learning rate that is left at the end; it falls linearly
-    average: Share = 0.0  # decay, an update, of the mean of past policies that the controller is; 0: the last one
+    final_rate: Share = 1.0  # final learning rate, as a share of the first; it falls linearly
+    average: Share = 0.0  # the controller is a mean of policies with this decay at each update; 0: the last policy
     critic_norm: bool = False  # layer norm in the critics
     hidden: Annotated[tuple[Annotated[int, Within(1, 16_384)], ...], Within(1, 16)] = (256, 256)  # paper
     discount: Share = 0.97
     initial_temperature: Annotated[float, Above(0, 1000)] = 0.1
-    arrival_bonus: Metres = 10.0  # reward for ending at the goal; without it, staying away earns entropy for ever
-    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # a fall costs what lying for ever this much farther off would [m]: at
-    # first, while each attempt to walk ends in one, and later; with 60 m the ant rather stood still
-    fall_ramp: tuple[Share, Share] = (0.2, 0.5)  # from where to where in the training it grows
-    alive_bonus: Metres = 0.0  # reward of each step on its feet (paper, for the humanoid), the only price of a fall
-    # then
-    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # of a velocity reward: being faster than this towards
-    # the goal earns no more
-    action_cost: Metres = 0.0  # price of a step with all actuators at their limits
-    tilt_m: Metres = 0.0  # a torso lying on its side is paid like being this much farther off [m]
+    arrival_bonus: Metres = 10.0  # reward for reaching the goal; without it, staying away would earn entropy for ever
+    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # a fall costs as much as lying for ever this much farther away [m]:
+    # at first, while every attempt to walk ends in a fall, and later; with 60 m the ant stood still
+    fall_ramp: tuple[Share, Share] = (0.2, 0.5)  # begin and end of the change of ``fall_m``, in shares of the training
+    alive_bonus: Metres = 0.0  # reward of each step without a fall (paper, for the humanoid); then a fall has no other
+    # cost
+    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # velocity reward: a higher speed towards the goal earns
+    # no more than this one
+    action_cost: Metres = 0.0  # cost of a step with all actuators at their limits
+    tilt_m: Metres = 0.0  # a torso on its side costs as much as being this much farther away [m]
     effort: Annotated[float, Above(0, 1)] = 1.0  # share of the actuators' range that the controller uses
-    greedy: Share = 0.0  # share of the environments in which it acts without chance, as it will later: else it never
-    # meets the places where only chance moved it on
+    greedy: Share = 0.0  # share of the environments with deterministic actions, as in later use: they visit states in
+    # which only random actions would make progress
     target_rate: Annotated[float, Above(0, 1)] = 0.005  # share of the new critic in the target critic at each update
-    replay: Count = 200_000  # transitions kept
-    turn_ramp: tuple[Share, Share] | None = None  # from where to where in the training robots begin to look anywhere;
-    # before, at the goal; without it, always anywhere
+    replay: Count = 200_000  # transitions in the replay buffer
+    turn_ramp: tuple[Share, Share] | None = None  # begin and end, in shares of the training, of a change of the first
+    # heading: from facing the goal to any heading; without it, always any heading
     episode_steps: Annotated[int, Within(1, 1_000_000)] = 60  # control steps to walk an edge
-    reset_velocity_mps: Annotated[float, Within(0, 100)] = 2.0  # spread of the speed at an edge's start: a plan arrives
-    # there moving
+    reset_velocity_mps: Annotated[float, Within(0, 100)] = 2.0  # spread of the speed at an edge's start: on a plan, the
+    # robot arrives there moving
     held_out: Annotated[float, Within(0, 0.9)] = 0.1  # share of the edges kept for the final test
-    frame: FrameName = "world"  # of what the networks see: the "world"'s, or the robot's own "heading"
-    mirror: bool = False  # replay each transition as one of the robot's symmetries would have it
-    relabel: Share = 0.0  # of the replayed steps are given a goal drawn around the robot: plans turn anywhere
-    relabel_m: Annotated[float, Above(0, 10_000)] = 10.0  # how far off those goals are, at most [m]
-    chain: bool = False  # after a success go on from there along a next edge, as a plan does
-    through: bool = False  # with ``chain``: an arrival ends nothing, what comes on the next edge counts as well
-    reward_scale: Annotated[float, Above(0, 1_000_000)] = 1.0  # of the reward in the losses
+    frame: FrameName = "world"  # frame of the networks' inputs: the "world"'s, or the robot's own "heading"
+    mirror: bool = False  # transform each replayed transition by a random symmetry of the robot
+    relabel: Share = 0.0  # share of replayed steps that get a random goal around the robot: plans turn in any direction
+    relabel_m: Annotated[float, Above(0, 10_000)] = 10.0  # largest distance of those goals [m]
+    chain: bool = False  # after a success, continue from there along another edge, as on a plan
+    through: bool = False  # with ``chain``: an arrival does not end the return; rewards on the next edge count
+    reward_scale: Annotated[float, Above(0, 1_000_000)] = 1.0  # factor of the reward in the losses
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, ramp in (("fall_ramp", self.fall_ramp), ("turn_ramp", self.turn_ramp)):
             if ramp is not None and ramp[0] > ramp[1]:
-                raise UserError(f"SacConfig.{name} is {ramp}; give first where it begins, then where it ends")
+                raise UserError(f"SacConfig.{name} is {ramp}; give its begin first, then its end")
         if self.through and not self.chain:
-            raise UserError("SacConfig.through is for chained edges, along which it learns through arrivals: set chain")
+            raise UserError("SacConfig.through needs chained edges; also set chain=True")
         if self.replay < self.envs:
-            raise UserError(f"SacConfig.replay is {self.replay}; give at least a step of each of envs, {self.envs}")
+            raise UserError(f"SacConfig.replay is {self.replay}; give at least the number of envs, {self.envs}")
 
 
 @struct.dataclass
 class SacState:
-    """Everything that training needs to go on."""
+    """The complete state of training, from which it can continue."""
 
     policy: Any
-    average: Any  # of the policies so far
+    average: Any  # moving average of the policies
     critic: Any
     target_critic: Any
     log_alpha: jax.Array
@@ -110,11 +110,11 @@ class SacState:
     iteration: jax.Array
 
 
-TESTS = 20  # of the controller as it would be by then, on held-out edges, in the course of its training
+TESTS = 20  # number of tests of the controller on held-out edges during its training
 
 
 def controller_inputs(observation: Float[Array, "*b P+2"], frame: str) -> Float[Array, "*b I"]:
-    """What the networks see of proprioception and the vector to the goal [m], in the given frame."""
+    """The networks' inputs: proprioception and the vector to the goal [m], in the given frame."""
     if frame == "world":
         return observation
     proprio, goal = observation[..., :-2], observation[..., -2:]
@@ -160,7 +160,7 @@ class SacController:
 
 
 def blank_controller(key: jax.Array, proprio_size: int, action_size: int, config: SacConfig) -> SacController:
-    """A controller of these sizes that has learned nothing."""
+    """An untrained controller of these sizes."""
     size = input_size(proprio_size, config.frame)
     return SacController(
         normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
@@ -173,7 +173,7 @@ def blank_controller(key: jax.Array, proprio_size: int, action_size: int, config
 
 
 def split_edges(roadmap: Roadmap, held_out: float, seed: int) -> tuple[Tasks, Tasks]:
-    """Edges, each in both directions, as training and held-out tasks: an edge's two directions stay together.
+    """Edges in both directions, as training tasks and held-out tasks. Both directions of an edge are in the same set.
 
     Raises:
         UserError: the roadmap has too few edges to hold any out.
@@ -192,7 +192,7 @@ def _tasks(roadmap: Roadmap, edges: np.ndarray) -> Tasks:
 
 
 def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
-    """The tasks, each followed by one of some that begin where it ends (the way back is always there)."""
+    """The tasks, each with ``choices`` random tasks that begin where it ends. The way back is always a candidate."""
     rng = np.random.default_rng(seed)
     start, goal = np.asarray(tasks.start), np.asarray(tasks.goal)
     _, place = np.unique(np.concatenate([start, goal]), axis=0, return_inverse=True)
@@ -204,10 +204,10 @@ def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
 
 
 class Replay(replay_buffers.UniformSamplingQueue):
-    """brax's queue, from which the same is drawn to the bit, as a ring.
+    """brax's queue as a ring buffer. Samples are the same to the bit.
 
-    brax's moves all that it holds at each insertion once it is full. Here positions only ever grow and rows are found
-    modulo the size, as brax looks them up.
+    Once it is full, brax's queue moves all its rows at each insertion. Here positions only grow, and rows are stored at
+    the position modulo the size, where brax looks them up.
     """
 
     def insert_internal(
@@ -226,15 +226,15 @@ class Replay(replay_buffers.UniformSamplingQueue):
 class Sac:
     """The learner: ``create`` and ``train`` on states, both pure.
 
-    What it keeps of a state, what its networks see of that, and the networks are methods, for other tasks to replace.
+    Subclasses can replace what the replay stores of a state, the networks' inputs, and the networks: these are methods.
     """
 
-    kept = 2  # numbers that the replay keeps of a state besides proprioception
+    kept = 2  # how many numbers the replay stores of a state besides proprioception
 
     def __init__(self, env: MazeEnv, config: SacConfig):
         """
         Args:
-            env: with auto-reset and without maps; its robot says which reward is used.
+            env: with auto-reset and without maps; its robot determines the reward.
         """
         if config.frame == "heading" and not env.robot.has_heading:
             raise UserError(f"robot '{env.robot.name}' has no heading; use frame='world'")
@@ -272,11 +272,11 @@ class Sac:
         )
 
     def _observe(self, state: State) -> Float[Array, "N P+kept"]:
-        """What the replay keeps of a state."""
+        """The part of a state that the replay stores."""
         return jnp.concatenate([state.obs["proprio"], state.obs["goal"]], -1)  # pyright: ignore
 
     def _see(self, observation: Float[Array, "N P+kept"], maze: Maze) -> Any:
-        """What the networks see of it, in that maze."""
+        """The networks' inputs, from observations in this maze."""
         del maze
         return controller_inputs(observation, self.config.frame)
 
@@ -310,7 +310,7 @@ class Sac:
         )
 
     def _train(self, state: SacState, iterations: int) -> tuple[SacState, dict[str, jax.Array]]:
-        """Run some iterations (static); returns means over them."""
+        """Run ``iterations`` iterations (static); returns the state and mean metrics."""
 
         def iterate(state: SacState, _) -> tuple[SacState, dict[str, jax.Array]]:
             state, collected = self._collect(self._ease(state))
@@ -329,7 +329,7 @@ class Sac:
         return state, means | rates
 
     def _ease(self, state: SacState) -> SacState:
-        """The state with its environments' starts as hard as they are by now."""
+        """The state with the difficulty of starts (``turn_ramp``) for this iteration."""
         if self.config.turn_ramp is None:
             return state
         share = jnp.interp(
@@ -376,8 +376,8 @@ class Sac:
     def _reward(self, before: State, action: jax.Array, after: State) -> jax.Array:
         """Dense reward towards the goal (paper, sec. III-G): progress [m/s] or minus the distance [m]; bonuses.
 
-        Of a fall without an alive bonus it is minus the distance, whatever the robot's reward: see ``_pay_falls``. What
-        breaks off otherwise counts as a fall, here and there.
+        For a fall without an alive bonus it is always minus the distance; see ``_pay_falls``.
+        An episode that breaks off for another reason counts as a fall.
         """
         config = self.config
         distance = jnp.linalg.norm(before.obs["goal"], axis=-1)  # pyright: ignore
@@ -400,9 +400,9 @@ class Sac:
         return jnp.minimum((before_m - after_m) / self.env.robot.control_dt_s, self.config.speed_mps or jnp.inf)
 
     def _relabel(self, batch: Transition, key: jax.Array) -> Transition:
-        """The batch with other goals for some of the steps, and what they would have earned on the way there.
+        """The batch with new goals for some of the steps, and the rewards for these goals.
 
-        Steps that ended an episode stay as they are: the goal after them is the next one's.
+        Steps that ended an episode are not changed: the goal after them belongs to the next episode.
         """
         config, tolerance = self.config, self.env.robot.goal_tolerance_m
         which_key, *goal_keys, next_key = jax.random.split(key, 4)
@@ -430,7 +430,7 @@ class Sac:
         )
 
     def _draw_goals(self, keys: list[jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Goals all around the robot, out of reach yet [m]."""
+        """Goals in all directions around the robot, outside the goal tolerance [m]."""
         angle_key, far_key = keys
         angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
         nearest, farthest = self.env.robot.goal_tolerance_m, self.config.relabel_m
@@ -438,9 +438,10 @@ class Sac:
         return distance[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
 
     def _pay_falls(self, batch: Transition, iteration: jax.Array) -> Transition:
-        """The batch with falls paid like lying for ever, ``fall_m`` farther off, as they cost by now.
+        """The batch with the cost of falls: as much as lying for ever, ``fall_m`` (at this iteration) farther away.
 
-        Without it a fall would end the losses of a robot far away. With an alive bonus it ends the gains.
+        Without this cost, a fall far from the goal would pay off: it ends the negative rewards. With an alive bonus the
+        rewards are gains, and a fall ends them.
         """
         if self.config.alive_bonus:
             return batch
@@ -451,20 +452,20 @@ class Sac:
         return batch._replace(reward=jnp.where(fall > 0, for_ever, batch.reward))
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
-        """The updates of an iteration; their batches are drawn at once, for meanwhile nothing is added."""
+        """The updates of an iteration. All batches are drawn at once, because nothing is added in between."""
         key, present_key, update_key = jax.random.split(state.key, 3)
         replay, drawn = self._buffer.sample_internal(state.replay)
         drawn = self._pay_falls(self._present(drawn, _one_maze(state), present_key), state.iteration)
         count = self.config.updates
         batches = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), drawn)
         state = state.replace(replay=replay, key=key)
-        # Of "rbg" keys the noise is one operation on a CPU; of the others it is a loop of many.
+        # With "rbg" keys, noise is one operation on a CPU; with other keys it is a loop of many.
         keys = jax.random.wrap_key_data(jax.random.bits(update_key, (count, 2, 4)), impl="rbg")
         state, losses = jax.lax.scan(self._update, state, (batches, keys))
         return state, jax.tree.map(jnp.mean, losses)
 
     def _present(self, batch: Transition, maze: Maze, key: jax.Array) -> Transition:
-        """A batch from the replay as the networks see it."""
+        """A batch from the replay, relabelled and mirrored if configured, as inputs of the networks."""
         mirror_key, goal_key = jax.random.split(key)
         if self.config.relabel:
             batch = self._relabel(batch, goal_key)
@@ -481,7 +482,7 @@ class Sac:
 
     def _update(self, state: SacState, drawn: tuple[Transition, jax.Array]) -> tuple[SacState, dict[str, jax.Array]]:
         batch, (policy_key, critic_key) = drawn
-        # The temperature and the policy are judged by the same actions, which are computed once.
+        # The losses of temperature and policy use the same key, so the same actions, which are computed once.
         alpha_loss, log_alpha, alpha_optimizer = self._alpha_update(
             state.log_alpha, state.policy, state.normalizer, batch, policy_key, optimizer_state=state.alpha_optimizer
         )
@@ -511,7 +512,7 @@ def _one_maze(state: SacState) -> Maze:
 
 @struct.dataclass
 class Steered:
-    """The controller heading straight for the environment's goal: how edges are tested."""
+    """The controller with the environment's goal as its target, for tests on edges."""
 
     controller: Controller
 
@@ -521,7 +522,7 @@ class Steered:
 
 
 def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
-    """Share of the given edges that the controller walks in time, from rest. ``env`` must not reset by itself."""
+    """Share of the given edges that the controller walks in time, from rest. ``env`` must be without auto-reset."""
     n = tasks.start.shape[0]
     keys = jax.random.split(key, n + 1)
     one_each = Tasks(tasks.start[:, None], tasks.goal[:, None], jnp.ones(n, jnp.int32))
@@ -533,14 +534,14 @@ def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: j
 def edges_in_a_row(
     env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array, *, edges: int = 20, walkers: int = 100
 ) -> float:
-    """Share of the walkers that, from rest, walk so many edges on end, each in time and without a fall.
+    """Share of the walkers that, from rest, walk ``edges`` edges in a row, each in time and without a fall.
 
-    ``env`` must reset by itself, and the tasks follow each other (``chain_tasks``).
+    ``env`` must have auto-reset, and the tasks must be chained (``chain_tasks``).
     """
     keys = jax.random.split(key, walkers + edges)
     state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, None)))(keys[:walkers], maze, tasks)
     walked, unbroken = np.zeros(walkers, int), np.ones(walkers, bool)
-    for i in range(edges):  # as many steps as the slowest may take
+    for i in range(edges):  # each rollout is one full horizon, the time limit of an edge
         state, _, steps = rollout(env, Steered(act), state, (), keys[walkers + i], env.horizon)
         ended = 1.0 - np.concatenate([np.asarray(steps.alive)[1:], 1.0 - np.asarray(state.done)[None]])
         won = np.asarray(steps.success) > 0
@@ -564,11 +565,11 @@ def train_controller(
 
     Args:
         env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
-        on_progress: told (iterations done, metrics) after every ``chunk`` iterations.
-        checkpoints: where to go on from, and where to save now and then and when interrupted.
+        on_progress: called with (iterations done, metrics) after every ``chunk`` iterations.
+        checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
 
     Returns:
-        The controller; its success on held-out edges and on twenty of any edges in a row.
+        The controller; its success on held-out edges, and on twenty edges in a row.
     """
     train_key, test_key, split_key, row_key = jax.random.split(key, 4)
     seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
