@@ -321,7 +321,7 @@ def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
             args=[*command.changes, *more],
         )
 
-    return _in_one_line(parse, f"{PROGRAM} train {command.robot} {ALL_SETTINGS}")
+    return _in_one_line(parse, f"{PROGRAM} train --help and {PROGRAM} train {command.robot} {ALL_SETTINGS}")
 
 
 def _print_settings(command: Any) -> None:

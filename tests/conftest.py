@@ -212,7 +212,7 @@ def tiny_settings():
 
     fit = p.FitConfig(updates=40, batch=4, steps=8)
     return p.Settings(
-        prm=p.PrmConfig(samples=40),
+        prm=p.PrmConfig(samples=40, most_samples=40),
         sac=p.SacConfig(envs=4, iterations=50, updates=1, warmup=2, batch=8, hidden=(8,), replay=200, episode_steps=5),
         collect=p.CollectConfig(
             trajectories=2, envs=8, horizon=50, reset_interval=8, starts="maze", guide="explorer", give_up=1000
