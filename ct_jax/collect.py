@@ -255,5 +255,5 @@ def _endpoints(
         pairs = jax.vmap(lambda k: sample_pair(k, maze, radius=env.robot.radius_m))(jax.random.split(pair_key, n))
         return roadmap.table, *pairs
     reachable = np.argwhere(np.isfinite(np.asarray(roadmap.table.distance)) & ~np.eye(prm.samples, dtype=bool))
-    chosen = reachable[np.asarray(jax.random.randint(pair_key, (n,), 0, len(reachable)))]
+    chosen = reachable[np.asarray(jax.random.randint(pair_key, (n,), 0, len(reachable), jnp.int32))]
     return roadmap.table, roadmap.table.points[chosen[:, 0]], roadmap.table.points[chosen[:, 1]]

@@ -376,7 +376,8 @@ class RoadmapGuide:
 
     def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: jax.Array) -> Int[Array, "N"]:
         away = jnp.linalg.norm(points - goal[:, None], axis=-1)
-        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6), -1)
+        hidden = jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6)
+        return jnp.argmin(away + hidden, -1).astype(jnp.int32)
 
     def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "N n 2"], radius: float) -> jax.Array:
         reach = segment_reach(self.look_m, self.radius_m + self.margin_m, self.cell_m)

@@ -197,17 +197,17 @@ def sample_windows(
     """
     which_key, where_key, mirror_key, shift_key = jax.random.split(key, 4)
     share = jnp.cumsum(trajectories.length)
-    which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
+    which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1], jnp.int32), side="right")
     length = trajectories.length[which]
     # Of a trajectory, the steps from one of the first few on by strides are one to draw from.
-    origin = jax.random.randint(jax.random.fold_in(where_key, 1), (batch,), 0, jnp.minimum(stride, length))
+    origin = jax.random.randint(jax.random.fold_in(where_key, 1), (batch,), 0, jnp.minimum(stride, length), jnp.int32)
     count = (length - origin + stride - 1) // stride
     # Pieces may begin at any step that leaves them full, or at the start of a short trajectory. Those that would hang
     # over an end are moved inside: else first and last steps would be in one piece of many that hold a middle one.
     last, beyond = jnp.maximum(count + overhang - steps, 0), steps - 1 - overhang
-    drawn = jax.random.uniform(where_key, (batch,)) * (last + 1 + 2 * beyond)
+    drawn = jax.random.uniform(where_key, (batch,), jnp.float32) * (last + 1 + 2 * beyond)
     first = jnp.clip(drawn.astype(jnp.int32) - beyond, 0, last)
-    at = origin[:, None] + stride * (first[:, None] + jnp.arange(steps)[None])
+    at = origin[:, None] + stride * (first[:, None] + jnp.arange(steps, dtype=jnp.int32)[None])
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731
@@ -222,14 +222,16 @@ def sample_windows(
         action=take(trajectories.action),
         target=take(trajectories.target),
         rtg=take(rtg),
-        timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1),
+        timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1, jnp.int32),
         valid=valid.astype(jnp.float32),
         learn=valid * take(trajectories.learn),
         reward=take(trajectories.reward),
     )
     if symmetries is None:
         return window
-    return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world)), symmetries, window)
+    return mirror_windows(
+        jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world), jnp.int32), symmetries, window
+    )
 
 
 def _see(
