@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import networkx as nx
 import numpy as np
 from jaxtyping import Float
@@ -223,7 +224,7 @@ def draw_wave(
     rooms = {i: make_room(jax.random.fold_in(room_key, i), prm, densities=densities) for i in sorted(set(which))}
     episodes = []
     for number, room in zip(numbers, which, strict=True):
-        seed = int(jax.random.bits(jax.random.fold_in(episode_key, number)))
+        seed = int(jax.random.bits(jax.random.fold_in(episode_key, number), dtype=jnp.uint32))
         start, goal = rooms[room].draw(np.random.default_rng([seed, 2]), config.starts)
         episodes.append(Episode(rooms[room].world, start, goal, seed))
     return Wave(episodes, [rooms[i] for i in which])

@@ -52,7 +52,7 @@ class Dropout(nn.Module):
         if deterministic or self.rate == 0.0:
             return x
         *lead, width = x.shape
-        words = jax.random.bits(self.make_rng("dropout"), (*lead, -(-width // 4)))
+        words = jax.random.bits(self.make_rng("dropout"), (*lead, -(-width // 4)), jnp.uint32)
         chance = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(*lead, -1)[..., :width]
         drop = round(_CHANCES * self.rate)
         return jnp.where(chance >= drop, x * (_CHANCES / (_CHANCES - drop)), 0.0)

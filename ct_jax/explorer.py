@@ -45,7 +45,7 @@ class ExplorerGuide:
 
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
         """Cells of which the local map at ``position`` shows at least one point."""
-        offset = (jnp.arange(MAP_CELLS) - (MAP_CELLS - 1) / 2) * self.map_cell_m
+        offset = (jnp.arange(MAP_CELLS, dtype=jnp.float32) - (MAP_CELLS - 1) / 2) * self.map_cell_m
         column, row = jnp.floor((position[:, None] + offset[None]) / maze.cell_m).astype(jnp.int32)
         height, width = maze.shape
         rows = jnp.any(row[:, None] == jnp.arange(height)[None], 0)
@@ -53,13 +53,13 @@ class ExplorerGuide:
         return rows[:, None] & columns[None, :]
 
     def _choose(self, believed: Maze, to_go: jax.Array, position: jax.Array, goal: jax.Array) -> jax.Array:
-        side = jnp.arange(-2, 3)
+        side = jnp.arange(-2, 3, dtype=jnp.int32)
         offsets = jnp.stack(jnp.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
         cells = cell_of(believed, position)[None] + offsets
         points = jnp.concatenate([goal[None], (cells[:, ::-1] + 0.5) * believed.cell_m])
         height, width = believed.shape
         on_grid = to_go[jnp.clip(cells[:, 0], 0, height - 1), jnp.clip(cells[:, 1], 0, width - 1)]
-        rest = jnp.concatenate([jnp.zeros(1), jnp.where(is_wall(believed, cells), jnp.inf, on_grid)])
+        rest = jnp.concatenate([jnp.zeros(1, jnp.float32), jnp.where(is_wall(believed, cells), jnp.inf, on_grid)])
         away = jnp.linalg.norm(points - position[None], axis=-1)
         reach = segment_reach(self.look_m, self.radius_m, self.cell_m)
         free = jax.vmap(lambda p: in_sight(believed, position, p, radius=self.radius_m, reach=reach))(points)

@@ -68,8 +68,8 @@ class Supervised:
 
     def init(self, state: State, own: Any, guided: Any) -> Watching:
         n = state.done.shape[0]
-        past = jnp.full((self.config.stuck_steps, n, 2), jnp.inf)
-        touched = jnp.zeros((self.config.stuck_steps, n))
+        past = jnp.full((self.config.stuck_steps, n, 2), jnp.inf, jnp.float32)
+        touched = jnp.zeros((self.config.stuck_steps, n), jnp.float32)
         return Watching(own, guided, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(n, bool))
 
     def act(self, memory: Watching, state: State, key: jax.Array) -> tuple[Action, Watching]:
@@ -78,10 +78,10 @@ class Supervised:
         guided, guided_memory = self.guided.act(memory.guided, state, guided_key)
         position = state.info["position"]
         rescued = memory.rescued | self._failed(memory, position)
-        rescued |= jax.random.bernoulli(chance_key, self.config.takeover, rescued.shape)
+        rescued |= jax.random.bernoulli(chance_key, jnp.float32(self.config.takeover), rescued.shape)
         action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
         if self.config.keep == "relabelled":
-            action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape))
+            action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape, jnp.float32))
         else:
             action = action._replace(learn=rescued.astype(jnp.float32))
         past = jnp.concatenate([memory.past[1:], position[None]])
@@ -123,9 +123,8 @@ def recover(
     """
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
     maze_key, wave_key = jax.random.split(key)
-    first_maze = int(
-        jax.random.randint(maze_key, (), 0, len(mazes.cell_m))
-    )  # so that each round uses other mazes if there are many
+    # Each round begins at another maze, if there are many.
+    first_maze = int(jax.random.randint(maze_key, (), 0, len(mazes.cell_m), jnp.int32))
     supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:

@@ -242,7 +242,9 @@ def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 
     ends = np.cumsum(others)
     if not ends[-1]:
         raise UserError("the roadmap joins no two of its points; raise prm.samples or prm.connect_m")
-    number = np.asarray(jax.random.randint(key, (n,), 0, int(ends[-1])))  # index of the pair, ordered by first point
+    number = np.asarray(
+        jax.random.randint(key, (n,), 0, int(ends[-1]), jnp.int32)
+    )  # index of the pair, ordered by first point
     first = np.searchsorted(ends, number, side="right")
     order = np.argsort(component, kind="stable")  # the members of each component, in order
     place = np.empty_like(order)
@@ -509,7 +511,8 @@ class RoadmapGuide:
 
     def _nearest_in_sight(self, points: Float[Array, "N n 2"], maze: Maze, goal: jax.Array) -> Int[Array, "N"]:
         away = jnp.linalg.norm(points - goal[:, None], axis=-1)
-        return jnp.argmin(away + jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6), -1)
+        hidden = jnp.where(self._sees(maze, goal, points, self.radius_m), 0.0, 1e6)
+        return jnp.argmin(away + hidden, -1).astype(jnp.int32)
 
     def _sees(self, maze: Maze, position: jax.Array, points: Float[Array, "N n 2"], radius: float) -> jax.Array:
         reach = segment_reach(self.look_m, self.radius_m + self.margin_m, self.cell_m)

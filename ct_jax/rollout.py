@@ -26,7 +26,7 @@ class Action(NamedTuple):
 
 def act_as_meant(action: Float[Array, "N A"]) -> Action:
     """An action that is executed without disturbance and imitated as it is."""
-    return Action(action, action, action, jnp.ones(action.shape[:1]))
+    return Action(action, action, action, jnp.ones(action.shape[:1], jnp.float32))
 
 
 class Policy(Protocol):
@@ -131,7 +131,7 @@ class Guided:
 
     def init(self, state: State, guide_memory: Any) -> tuple[Any, jax.Array]:
         n = state.done.shape[0]
-        return guide_memory, jnp.zeros((n, self.controller.action_size))
+        return guide_memory, jnp.zeros((n, self.controller.action_size), jnp.float32)
 
     def intend(self, guide_memory: Any, state: State) -> tuple[jax.Array, Any]:
         """The controller's action without disturbance."""
@@ -145,6 +145,7 @@ class Guided:
         if not self.noise:
             return act_as_meant(action), (guide_memory, disturbance)
         keep_key, new_key = jax.random.split(key)
-        keep = jax.random.bernoulli(keep_key, self.hold, disturbance.shape[:1])[:, None]
-        disturbance = jnp.where(keep, disturbance, self.noise * jax.random.normal(new_key, disturbance.shape))
+        keep = jax.random.bernoulli(keep_key, jnp.float32(self.hold), disturbance.shape[:1])[:, None]
+        drawn = self.noise * jax.random.normal(new_key, disturbance.shape, jnp.float32)
+        disturbance = jnp.where(keep, disturbance, drawn)
         return act_as_meant(action)._replace(done=action + disturbance), (guide_memory, disturbance)

@@ -242,17 +242,17 @@ def sample_windows(
     """
     which_key, where_key, mirror_key, shift_key, origin_key = jax.random.split(key, 5)
     share = jnp.cumsum(trajectories.length)
-    which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1]), side="right")
+    which = jnp.searchsorted(share, jax.random.randint(which_key, (batch,), 0, share[-1], jnp.int32), side="right")
     length = trajectories.length[which]
     # A window takes every ``stride``-th step of its trajectory, counted from a random one of the first few.
-    origin = jax.random.randint(origin_key, (batch,), 0, jnp.minimum(stride, length))
+    origin = jax.random.randint(origin_key, (batch,), 0, jnp.minimum(stride, length), jnp.int32)
     count = (length - origin + stride - 1) // stride
     # A window begins at any step that leaves it full, or at the start of a short trajectory. A window that would reach
     # over an end is moved inside. Otherwise the first and last steps would be in fewer windows than the middle ones.
     last, beyond = jnp.maximum(count + overhang - steps, 0), steps - 1 - overhang
-    drawn = jax.random.uniform(where_key, (batch,)) * (last + 1 + 2 * beyond)
+    drawn = jax.random.uniform(where_key, (batch,), jnp.float32) * (last + 1 + 2 * beyond)
     first = jnp.clip(drawn.astype(jnp.int32) - beyond, 0, last)
-    at = origin[:, None] + stride * (first[:, None] + jnp.arange(steps)[None])
+    at = origin[:, None] + stride * (first[:, None] + jnp.arange(steps, dtype=jnp.int32)[None])
     valid = at < length[:, None]
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731
@@ -267,14 +267,16 @@ def sample_windows(
         action=take(trajectories.action),
         target=take(trajectories.target),
         rtg=take(rtg),
-        timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1),
+        timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1, jnp.int32),
         valid=valid.astype(jnp.float32),
         learn=valid * take(trajectories.learn),
         reward=take(trajectories.reward),
     )
     if symmetries is None:
         return window
-    return mirror_windows(jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world)), symmetries, window)
+    return mirror_windows(
+        jax.random.randint(mirror_key, (batch,), 0, len(symmetries.world), jnp.int32), symmetries, window
+    )
 
 
 def _see(

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training.acme.running_statistics import NestedMeanStd
 from flax import struct
 from jax.typing import DTypeLike
@@ -75,6 +76,7 @@ class ModelConfig(Checked):
 
 
 _NEVER = -(10**6)  # the step of a token that is not there
+_FIRST = np.int32(0)  # an index of the type of the others, also where JAX has 64 bits
 
 
 @struct.dataclass
@@ -318,7 +320,7 @@ class ControlTransformer(nn.Module):
             action = self.head(x, proprio)
         else:
             action = self.predict_action(x).reshape(*x.shape[:-1], n, self.action_size)
-        return Modes(action, self.predict_mode(x) if n > 1 else jnp.zeros((*x.shape[:-1], n)))
+        return Modes(action, self.predict_mode(x) if n > 1 else jnp.zeros((*x.shape[:-1], n), jnp.float32))
 
     def __call__(self, *window: Any, **options: Any) -> Float[Array, "B S A"]:
         """The likeliest of the actions that ``propose`` has for each step."""
@@ -343,7 +345,7 @@ class ControlTransformer(nn.Module):
         tokens += [self.embed_action(action)] if self.config.actions else []
         x = (jnp.stack(tokens, 2) + self._embed_time(timestep)[:, :, None]).reshape(batch, n * steps, -1)
         x = self.dropout(self.norm_in(x), deterministic=deterministic)
-        step = jnp.arange(n * steps) // n
+        step = jnp.arange(n * steps, dtype=jnp.int32) // n
         mask = band(step, step, context or self.config.context) & jnp.tri(n * steps, dtype=bool)
         mask = mask[None] & (jnp.repeat(valid, n, 1) > 0)[:, None, :] | jnp.eye(n * steps, dtype=bool)[None]
         for block in self.blocks[:-1]:
@@ -377,7 +379,7 @@ class ControlTransformer(nn.Module):
         place = t % (cache.step.shape[-1] // n) * n
         all_steps = jax.lax.dynamic_update_slice(cache.step, step_of[None], (which, place))
         step = mine(all_steps, axis=0)
-        order = jnp.arange(n)
+        order = jnp.arange(n, dtype=jnp.int32)
         later = jnp.zeros_like(step).at[place + order].set(order)  # of the new tokens, none sees a later one
         mask = band(step_of, step, self.config.context_acting) & (later[None, :] <= order[:, None])
         mask = jnp.broadcast_to(mask, (x.shape[0], *mask.shape))
@@ -385,15 +387,15 @@ class ControlTransformer(nn.Module):
         for block, old_keys, old_values in zip(self.blocks, cache.keys, cache.values, strict=True):
             q, k, v = block.heads(x)
             for new, old, kept in ((k, old_keys, keys), (v, old_values, values)):
-                at = (0, which, 0, 0, place)
+                at = (_FIRST, which, _FIRST, _FIRST, place)
                 kept.append(jax.lax.dynamic_update_slice(old, jnp.moveaxis(new, 1, -1)[:, None], at))
             seen_k, seen_v = (jnp.moveaxis(mine(kept[-1], axis=1), -1, 1) for kept in (keys, values))
             x = block.attend(x, q, seen_k, seen_v, mask, True)
         modes = self._predict(x[:, -1], proprio)
         stay = self.config.commitment * jax.nn.one_hot(cache.mode, self.config.modes)
-        mode = jnp.argmax(modes.logit + stay, -1)
+        mode = jnp.argmax(modes.logit + stay, -1).astype(jnp.int32)
         action = jnp.clip(modes.take(mode), -1.0, 1.0)
-        actions = jax.lax.dynamic_update_slice(cache.action, action[:, None], (0, which, 0))
+        actions = jax.lax.dynamic_update_slice(cache.action, action[:, None], (_FIRST, which, _FIRST))
         return action, Cache(tuple(keys), tuple(values), all_steps, cache.now + 1, actions, mode)
 
     def act_on_window(
@@ -417,7 +419,7 @@ class ControlTransformer(nn.Module):
             map=put(history.map, maps), proprio=put(history.proprio, proprio), goal=put(history.goal, goal),
             action=put(history.action, blank), rtg=put(history.rtg, rtg), now=history.now + 1,
         )  # fmt: skip
-        order = jnp.arange(places)
+        order = jnp.arange(places, dtype=jnp.int32)
         timestep = jnp.broadcast_to(history.now - place + order, rtg.shape + order.shape)
         valid = jnp.broadcast_to((order <= place).astype(jnp.float32), timestep.shape)
         modes = self.propose(seen.map, seen.proprio, seen.goal, seen.action, seen.rtg, timestep, valid, context=places)
@@ -434,13 +436,13 @@ def band(query: Int[Array, "T"], key: Int[Array, "M"], context: int) -> Bool[Arr
 def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
     """The cache before the first step of N episodes."""
     places = config.tokens * (config.context_acting + 1)
-    empty = jnp.zeros((n, config.stride, config.heads, config.width // config.heads, places))
+    empty = jnp.zeros((n, config.stride, config.heads, config.width // config.heads, places), jnp.float32)
     return Cache(
         keys=(empty,) * config.layers,
         values=(empty,) * config.layers,
         step=jnp.full((config.stride, places), _NEVER, jnp.int32),
         now=jnp.zeros((), jnp.int32),
-        action=jnp.zeros((n, config.stride, action_size)),
+        action=jnp.zeros((n, config.stride, action_size), jnp.float32),
         mode=jnp.full(n, -1, jnp.int32),
     )
 
@@ -448,14 +450,14 @@ def empty_cache(config: ModelConfig, action_size: int, n: int) -> Cache:
 def empty_history(config: ModelConfig, proprio_size: int, action_size: int, n: int) -> History:
     """The history before the first step of N episodes."""
     k = config.context_acting
-    proprio, goal, action = (jnp.zeros((n, k, size)) for size in (proprio_size, 2, action_size))
+    proprio, goal, action = (jnp.zeros((n, k, size), jnp.float32) for size in (proprio_size, 2, action_size))
     maps = jnp.zeros((n, k, 2, MAP_CELLS, MAP_CELLS), jnp.uint8)
-    return History(maps, proprio, goal, action, jnp.zeros((n, k)), jnp.zeros((), jnp.int32))
+    return History(maps, proprio, goal, action, jnp.zeros((n, k), jnp.float32), jnp.zeros((), jnp.int32))
 
 
 def sample_inputs(proprio_size: int, action_size: int) -> tuple[jax.Array, ...]:
     """Inputs of one step, from which parameters are initialised."""
-    one = jnp.zeros((1, 1))
+    one = jnp.zeros((1, 1), jnp.float32)
     maps = jnp.zeros((1, 1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8)
-    proprio, goal, action = (jnp.zeros((1, 1, size)) for size in (proprio_size, 2, action_size))
+    proprio, goal, action = (jnp.zeros((1, 1, size), jnp.float32) for size in (proprio_size, 2, action_size))
     return maps, proprio, goal, action, one, jnp.zeros((1, 1), jnp.int32), one

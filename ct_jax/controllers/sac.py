@@ -159,11 +159,18 @@ class SacController:
         return self.effort * networks.parametric_action_distribution.mode(logits)
 
 
+def blank_statistics(size: int) -> running_statistics.RunningStatisticsState:
+    """brax's running statistics of inputs of this size, of none so far; in 32 bits, also where JAX has 64."""
+    blank = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
+    names = ("mean", "summed_variance", "std", "std_eps")
+    return blank.replace(**{name: jnp.asarray(getattr(blank, name), jnp.float32) for name in names})
+
+
 def blank_controller(key: jax.Array, proprio_size: int, action_size: int, config: SacConfig) -> SacController:
     """An untrained controller of these sizes."""
     size = input_size(proprio_size, config.frame)
     return SacController(
-        normalizer=running_statistics.init_state(specs.Array((size,), jnp.dtype("float32"))),
+        normalizer=blank_statistics(size),
         policy=controller_networks(size, action_size, config.hidden).policy_network.init(key),
         action_size=action_size,
         hidden=config.hidden,
@@ -253,14 +260,14 @@ class Sac:
         self._alpha_update = update(alpha_loss, self._optimizer)
         self._critic_update = update(critic_loss, self._optimizer)
         self._actor_update = update(actor_loss, self._optimizer)
-        size = env.proprio_size + self.kept
+        observation, number = (jnp.zeros(shape, jnp.float32) for shape in (env.proprio_size + self.kept, ()))
         example = Transition(
-            observation=jnp.zeros(size),
-            action=jnp.zeros(env.action_size),
-            reward=jnp.zeros(()),
-            discount=jnp.zeros(()),
-            next_observation=jnp.zeros(size),
-            extras={"state_extras": {"truncation": jnp.zeros(()), "fall": jnp.zeros(())}},
+            observation=observation,
+            action=jnp.zeros(env.action_size, jnp.float32),
+            reward=number,
+            discount=number,
+            next_observation=observation,
+            extras={"state_extras": {"truncation": number, "fall": number}},
         )
         self._buffer = Replay(config.replay, example, config.updates * config.batch)
         self.train = jax.jit(self._train, static_argnames="iterations")
@@ -289,10 +296,10 @@ class Sac:
         policy_key, critic_key, buffer_key, env_key, key = jax.random.split(key, 5)
         policy = self.networks.policy_network.init(policy_key)
         critic = self.networks.q_network.init(critic_key)
-        log_alpha = jnp.log(jnp.asarray(self.config.initial_temperature))
+        log_alpha = jnp.log(jnp.asarray(self.config.initial_temperature, jnp.float32))
         resets = jax.vmap(self.env.reset, in_axes=(0, None, None))
         if self.config.turn_ramp is not None and tasks is not None:
-            tasks = tasks.replace(turn_rad=jnp.zeros(()))
+            tasks = tasks.replace(turn_rad=jnp.zeros((), jnp.float32))
         return SacState(
             policy=policy,
             average=policy,
@@ -302,7 +309,7 @@ class Sac:
             policy_optimizer=self._optimizer.init(policy),
             critic_optimizer=self._optimizer.init(critic),
             alpha_optimizer=self._optimizer.init(log_alpha),
-            normalizer=running_statistics.init_state(specs.Array((self._input_size,), jnp.dtype("float32"))),
+            normalizer=blank_statistics(self._input_size),
             replay=self._buffer.init(buffer_key),
             env=resets(jax.random.split(env_key, self.config.envs), maze, tasks),
             key=key,
@@ -335,7 +342,7 @@ class Sac:
         share = jnp.interp(
             state.iteration / self.config.iterations, jnp.asarray(self.config.turn_ramp), jnp.arange(2.0)
         )
-        tasks = state.env.info["tasks"].replace(turn_rad=jnp.full(self.config.envs, jnp.pi * share))
+        tasks = state.env.info["tasks"].replace(turn_rad=jnp.full(self.config.envs, jnp.pi * share, jnp.float32))
         return state.replace(env=state.env.replace(info=state.env.info | {"tasks": tasks}))
 
     def _collect(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
@@ -344,11 +351,11 @@ class Sac:
         inputs = self._see(observation, _one_maze(state))
         logits = self.networks.policy_network.apply(state.normalizer, state.policy, inputs)
         distribution = self.networks.parametric_action_distribution
-        action = distribution.sample(logits, act_key)
+        action = distribution.sample(logits, act_key).astype(jnp.float32)
         if self.config.greedy:
             without = jnp.arange(len(action)) < self.config.greedy * len(action)
             action = jnp.where(without[:, None], distribution.mode(logits), action)
-        random = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
+        random = jax.random.uniform(random_key, action.shape, jnp.float32, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
         after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
         reward = self._reward(state.env, action, after)
@@ -407,7 +414,7 @@ class Sac:
         config, tolerance = self.config, self.env.robot.goal_tolerance_m
         which_key, *goal_keys, next_key = jax.random.split(key, 4)
         shape = batch.reward.shape
-        chosen = jax.random.bernoulli(which_key, config.relabel, shape) & (batch.discount > 0)
+        chosen = jax.random.bernoulli(which_key, jnp.float32(config.relabel), shape) & (batch.discount > 0)
         goal = self._draw_goals(goal_keys, shape)
         old, old_after = batch.observation[:, -2:], batch.next_observation[:, -2:]
         after = goal - (old - old_after)
@@ -432,9 +439,9 @@ class Sac:
     def _draw_goals(self, keys: list[jax.Array], shape: tuple[int, ...]) -> jax.Array:
         """Goals in all directions around the robot, outside the goal tolerance [m]."""
         angle_key, far_key = keys
-        angle = jax.random.uniform(angle_key, shape, maxval=2 * jnp.pi)
+        angle = jax.random.uniform(angle_key, shape, jnp.float32, maxval=2 * jnp.pi)
         nearest, farthest = self.env.robot.goal_tolerance_m, self.config.relabel_m
-        distance = jax.random.uniform(far_key, shape, minval=nearest, maxval=farthest)
+        distance = jax.random.uniform(far_key, shape, jnp.float32, minval=nearest, maxval=farthest)
         return distance[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
 
     def _pay_falls(self, batch: Transition, iteration: jax.Array) -> Transition:
@@ -448,7 +455,7 @@ class Sac:
         config, fall = self.config, batch.extras["state_extras"]["fall"]
         share = iteration / config.iterations
         farther = jnp.interp(share, jnp.asarray(config.fall_ramp), jnp.asarray(config.fall_m))
-        for_ever = (batch.reward - farther) / (1.0 - config.discount)
+        for_ever = ((batch.reward - farther) / (1.0 - config.discount)).astype(jnp.float32)
         return batch._replace(reward=jnp.where(fall > 0, for_ever, batch.reward))
 
     def _updates(self, state: SacState) -> tuple[SacState, dict[str, jax.Array]]:
@@ -460,7 +467,7 @@ class Sac:
         batches = jax.tree.map(lambda leaf: leaf.reshape(count, -1, *leaf.shape[1:]), drawn)
         state = state.replace(replay=replay, key=key)
         # With "rbg" keys, noise is one operation on a CPU; with other keys it is a loop of many.
-        keys = jax.random.wrap_key_data(jax.random.bits(update_key, (count, 2, 4)), impl="rbg")
+        keys = jax.random.wrap_key_data(jax.random.bits(update_key, (count, 2, 4), jnp.uint32), impl="rbg")
         state, losses = jax.lax.scan(self._update, state, (batches, keys))
         return state, jax.tree.map(jnp.mean, losses)
 
@@ -473,7 +480,7 @@ class Sac:
             batch = batch._replace(discount=1.0 - batch.extras["state_extras"]["fall"])
         now, action, after = batch.observation, batch.action, batch.next_observation
         if self._symmetries is not None:
-            pick = jax.random.randint(mirror_key, (len(action),), 0, len(self._symmetries.world))
+            pick = jax.random.randint(mirror_key, (len(action),), 0, len(self._symmetries.world), jnp.int32)
             world, proprio, joints = (jnp.asarray(matrices)[pick] for matrices in self._symmetries)
             halves = lambda o: (transform(proprio, o[:, :-2]), transform(world, o[:, -2:]))  # noqa: E731
             now, after = (jnp.concatenate(halves(o), -1) for o in (now, after))
@@ -572,7 +579,7 @@ def train_controller(
         The controller; its success on held-out edges, and on twenty edges in a row.
     """
     train_key, test_key, split_key, row_key = jax.random.split(key, 4)
-    seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1))
+    seed = int(jax.random.randint(split_key, (), 0, 2**31 - 1, jnp.int32))
     train_tasks, test_tasks = split_edges(roadmap, config.held_out, seed)
     if config.chain:
         train_tasks = chain_tasks(train_tasks, seed)

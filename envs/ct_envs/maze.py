@@ -369,7 +369,7 @@ def is_wall(maze: Maze, cell: Int[Array, "... 2"]) -> Bool[Array, "..."]:
 
 def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
     """Offsets (row, column) of the (2 reach + 1)^2 cells around a cell."""
-    side = jnp.arange(-reach, reach + 1)
+    side = jnp.arange(-reach, reach + 1, dtype=jnp.int32)
     return jnp.stack(jnp.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
 
 
@@ -455,12 +455,12 @@ def sample_free(
     The cell is uniform over the free ones, or over the region of ``free_cells[index]`` if that is given; the point is
     uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are.
     """
-    return _place(jax.random.uniform(key, (3,)), maze, radius, index)
+    return _place(jax.random.uniform(key, (3,), jnp.float32), maze, radius, index)
 
 
 def sample_pair(key: jax.Array, maze: Maze, *, radius: float) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """A random start and a random goal of the same region, both with clearance ``radius`` [m]."""
-    chance = jax.random.uniform(key, (6,))  # one draw: this runs in every step of every environment
+    chance = jax.random.uniform(key, (6,), jnp.float32)  # one draw: this runs in every step of every environment
     start, index = _place(chance[:3], maze, radius)
     return start, _place(chance[3:], maze, radius, index)[0]
 

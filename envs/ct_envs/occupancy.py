@@ -28,12 +28,12 @@ def local_map(
 
     Its entries are bytes: memory bandwidth limits the speed of thousands of maps a step.
     """
-    offset = (jnp.arange(cells) - (cells - 1) / 2) * cell_m
+    offset = (jnp.arange(cells, dtype=jnp.float32) - (cells - 1) / 2) * cell_m
     column, row = (jnp.floor((position[:, None] + offset[None]) / maze.cell_m)).astype(jnp.int32)
     height, width = maze.shape
     # Padding and border are wall, so a point outside the array can use the nearest cell inside.
     walls = maze.walls[jnp.clip(row, 0, height - 1)[:, None], jnp.clip(column, 0, width - 1)[None, :]]
     at = jnp.round((goal - position) / cell_m + (cells - 1) / 2).astype(jnp.int32)
-    index = jnp.arange(cells)
+    index = jnp.arange(cells, dtype=jnp.int32)
     here = (index[:, None] == at[1]) & (index[None, :] == at[0])
     return jnp.stack([walls, here]).astype(jnp.uint8)

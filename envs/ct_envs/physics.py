@@ -128,18 +128,20 @@ class MjxEngine:
 
     def __init__(self, model: mujoco.MjModel, n_substeps: int, cell_m: float):
         self.model, self.n_substeps, self.cell_m = model, n_substeps, cell_m
-        self._mjx_model = mjx.put_model(model)
+        with jax.enable_x64(False):
+            self._mjx_model = mjx.put_model(model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
-        data = mjx.make_data(self._mjx_model).replace(
-            qpos=state.qpos,
-            qvel=state.qvel,
-            qacc_warmstart=state.qacc_warmstart,
-            mocap_pos=walls,
-            ctrl=ctrl,
-        )
-        data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps)
-        touching = jnp.any(data.sensordata > 0).astype(jnp.float32)
+        with jax.enable_x64(False):  # with 64 bits, MJX mixes them with 32
+            data = mjx.make_data(self._mjx_model).replace(
+                qpos=state.qpos,
+                qvel=state.qvel,
+                qacc_warmstart=state.qacc_warmstart,
+                mocap_pos=walls,
+                ctrl=ctrl,
+            )
+            data, _ = jax.lax.scan(lambda d, _: (mjx.step(self._mjx_model, d), None), data, length=self.n_substeps)
+            touching = jnp.any(data.sensordata > 0).astype(jnp.float32)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), touching
 
 

@@ -1,0 +1,158 @@
+"""With JAX_ENABLE_X64=1 all is as without: what is drawn, what happens, and the 32 bits in which it is kept."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
+from ct_envs.robots import ANT
+from ct_jax.collect import CollectConfig, collect
+from ct_jax.controllers.sac import Sac, SacConfig, chain_tasks, split_edges
+from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.finetune import RecoverConfig, recover
+from ct_jax.fit import Fit, FitConfig, fit, init_params, transformer_loss, value_loss
+from ct_jax.policy import TransformerPolicy
+from ct_jax.prm import PrmConfig, build_roadmap
+from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+from ct_jax.value import ValueNetwork
+
+pytestmark = pytest.mark.rank_promotion("allow")  # MJX and brax
+
+PRM = PrmConfig(samples=40)
+
+
+@pytest.fixture
+def both():
+    """What a function gives without 64 bits and with them; both as NumPy."""
+
+    def call(function):
+        found = []
+        for wide in (False, True):
+            jax.config.update("jax_enable_x64", wide)
+            try:
+                found.append(jax.device_get(function()))
+            finally:
+                jax.config.update("jax_enable_x64", False)
+        return found
+
+    return call
+
+
+def plain(leaf):
+    """An array, of a random key its numbers."""
+    leaf = jnp.asarray(leaf) if not isinstance(leaf, np.ndarray) else leaf
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf)
+
+
+def assert_alike(narrow, wide, *, atol: float = 1e-4) -> None:
+    """The same numbers in the same types."""
+    assert jax.tree.structure(narrow) == jax.tree.structure(wide)
+    for (path, a), b in zip(jax.tree.leaves_with_path(narrow), jax.tree.leaves(wide), strict=True):
+        a, b = plain(a), plain(b)
+        where = jax.tree_util.keystr(path)
+        assert a.dtype == b.dtype, f"{where}: {a.dtype} and {b.dtype}"
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=atol, err_msg=where)
+
+
+@pytest.mark.parametrize(("robot", "engine"), [(POINT, "mujoco"), (POINT, "mjx"), (ANT, "mujoco")])
+@pytest.mark.parametrize("auto_reset", [True, False])
+def test_environments(both, robot, engine, auto_reset):
+    env = MazeEnv(robot, engine=engine, auto_reset=auto_reset, horizon=3)
+    maze = load_maze("antmaze-umaze")
+
+    def drive():
+        state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 4), maze)
+        step = jax.vmap(env.step)
+        actions = np.random.default_rng(0).uniform(-1.2, 1.2, (5, 4, env.action_size))  # float64
+        once = jax.jit(lambda state, actions: jax.lax.scan(lambda s, a: (step(s, a), s), state, actions))
+        return once(state, jnp.asarray(actions))
+
+    assert_alike(*both(drive), atol=1e-3)
+
+
+def few(maze):
+    return draw_pairs(0, maze, 3, radius_m=POINT.radius_m, tolerance_m=POINT.goal_tolerance_m)
+
+
+def happened(maze, method, **who):
+    """The episodes of a method in the first 60 steps, its pairs included."""
+    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=60)
+    done = evaluate(env, maze, few(maze), method, prm=PRM, **who)
+    names = ("success", "collided", "fell", "timeout", "steps", "returns", "travelled_m", "path", "asked")
+    pairs = (done.pairs.start, done.pairs.goal, np.asarray(done.pairs.shortest_m, np.float32))
+    return {name: np.asarray(value, np.float32) for name in names if (value := getattr(done, name)) is not None}, pairs
+
+
+@pytest.mark.parametrize("method", ["planner", "explorer"])
+def test_guides(both, push, method):
+    assert_alike(*both(lambda: happened(load_maze("antmaze-large"), method, controller=push())), atol=0.1)
+
+
+CONFIG = ModelConfig(layers=1, heads=2, width=8, context=3, context_acting=3, max_timestep=8, modes=2, stride=2)
+
+
+def transformer(reprompt: bool = False) -> TransformerPolicy:
+    inputs = sample_inputs(2, 2)
+    return TransformerPolicy(
+        jax.jit(ControlTransformer(CONFIG, 2).init)(jax.random.key(0), *inputs),
+        jax.jit(ValueNetwork(4).init)(jax.random.key(0), *inputs[:3]), CONFIG, 2, value_width=4, reprompt=reprompt,
+    )  # fmt: skip
+
+
+def test_the_transformer_acts(both):
+    policy = jax.device_get(transformer(reprompt=True))  # as a shipped model's: drawn without 64 bits
+    assert_alike(*both(lambda: happened(load_maze("antmaze-large"), "ct", policy=policy)), atol=1e-2)
+
+
+@pytest.mark.parametrize("options", [{}, {"relabel": 0.5, "mirror": True, "chain": True, "turn_ramp": (0.2, 0.6)}])
+def test_sac_updates(both, options):
+    """What is kept has the same types, and the random beginning is the same; brax's own draws differ afterwards."""
+    config = SacConfig(envs=4, iterations=8, updates=1, warmup=2, batch=8, hidden=(8,), replay=64, episode_steps=4)
+    robot = ANT if options else POINT
+    maze = load_maze("antmaze-umaze")
+
+    def learn():
+        sac = Sac(MazeEnv(robot, engine="mujoco", maps=False, horizon=4), replace(config, **options))
+        roadmap = build_roadmap(jax.random.key(0), maze, radius_m=robot.radius_m, config=PRM)
+        tasks = chain_tasks(split_edges(roadmap, 0.2, 0)[0], 0)
+        state, metrics = sac.train(sac.create(jax.random.key(0), maze, tasks), config.warmup + 1)
+        assert np.isfinite(jax.tree.leaves(metrics)).all()
+        return state
+
+    narrow, wide = both(learn)
+    assert_alike(narrow.replay.data[:8], wide.replay.data[:8], atol=1e-3)
+    assert_alike(*(jax.tree.map(lambda leaf: np.zeros(0, plain(leaf).dtype), state) for state in (narrow, wide)))
+
+
+@pytest.mark.parametrize("kind", ["transformer", "value"])
+def test_fit_updates(both, toy_data, kind):
+    data = toy_data([9, 12], side_m=20.0)
+    mazes = stack_mazes([load_maze("antmaze-umaze")])
+    model = ControlTransformer(CONFIG, 2) if kind == "transformer" else ValueNetwork(4)
+    loss = transformer_loss(model) if isinstance(model, ControlTransformer) else value_loss(model)
+    config = FitConfig(updates=2, batch=4, steps=4, warmup=1, mirror=True, shift_timestep=2)
+    params = jax.device_get(init_params(jax.random.key(0), model, data))
+
+    def learn():
+        return fit(jax.random.key(0), Fit(loss, config, 0.8, POINT, stride=2), params, data, mazes)
+
+    assert_alike(*both(learn))
+
+
+def test_collection_and_recoveries(both, push):
+    mazes = stack_mazes([load_maze("antmaze-umaze")] * 2)
+    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=200)
+    config = CollectConfig(trajectories=3, reset_interval=2, envs=4, horizon=200, noise=0.3)
+    recovering = RecoverConfig(recoveries=1, stuck_steps=5, patience=10, takeover=0.1, keep="joined")
+    policy = jax.device_get(transformer())
+    seeing = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=200)
+
+    def gather():
+        collected = collect(jax.random.key(0), env, mazes, push(), config, PRM)
+        recovered = recover(jax.random.key(0), seeing, mazes, policy, push(), recovering, config, PRM)
+        return [(data.length, data.goal, data.position[:, 0]) for data in (collected, recovered)]
+
+    assert_alike(*both(gather), atol=1e-2)
