@@ -92,7 +92,7 @@ class Space(Protocol):
         ...
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
-        """Connected free regions, int [k], of points [k, 2] (m): a robot of ``radius`` [m] never changes its region."""
+        """Free regions, int [k], of points [k, 2] (m), that a robot of ``radius`` [m] can cross; 0 is no such region."""
         ...
 
 
@@ -215,13 +215,15 @@ def _suffices(roadmap: Roadmap, ends: np.ndarray | None) -> bool:
 
     Pairs in different free regions do not count.
     """
-    space = as_space(roadmap.maze)
+    space, radius = as_space(roadmap.maze), roadmap.radius_m + roadmap.config.margin_m
     if ends is None:
-        region, component = space.regions(roadmap.points, roadmap.radius_m), roadmap.components
-        possible, joined = (int((np.bincount(of) ** 2).sum()) for of in (region, component))
+        region = space.regions(roadmap.points, radius)
+        inside = region > 0
+        possible, joined = (int((np.bincount(of[inside]) ** 2).sum()) for of in (region, roadmap.components))
         return joined >= _JOINED_SHARE * possible
-    region = space.regions(np.asarray(ends).reshape(-1, 2), roadmap.radius_m).reshape(-1, 2)
-    return bool((joins(roadmap, ends) | (region[:, 0] != region[:, 1])).all())
+    region = space.regions(np.asarray(ends).reshape(-1, 2), radius).reshape(-1, 2)
+    together = (region[:, 0] == region[:, 1]) & (region[:, 0] > 0)
+    return bool((joins(roadmap, ends) | ~together).all())
 
 
 def joins(roadmap: Roadmap, ends: Float[np.ndarray, "k 2 2"]) -> Bool[np.ndarray, "k"]:

@@ -13,6 +13,8 @@ from scipy import stats
 
 from ct_envs import UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_envs.maze import load_walls, parse_walls
+from ct_envs.turtlebot3 import RADIUS_M
+from ct_envs.turtlebot3_world import random_world
 from ct_jax.prm import (
     NO_HOP,
     NoPath,
@@ -356,3 +358,12 @@ def test_guides_recover_from_disturbances():
     ends = np.stack([roadmap_of(NAMES[which], PrmConfig()).points[[i, i + 30]] for i, which in enumerate(WHICH)])
     path = guided(RoadmapGuide(RADIUS), ends, noise=0.1)
     assert (np.linalg.norm(path - ends[None, :, 1], axis=-1).min(0) < 0.5).all()
+
+
+@pytest.mark.parametrize("density", [1.0, 2.0, 2.5])
+def test_a_cluttered_room_with_gaps_that_are_too_narrow_asks_for_no_more_points(density):
+    """The robot fits through the gaps, but not with its margin: more samples would never join what they part."""
+    config = PrmConfig(samples=150, connect_m=2.0, margin_m=0.08)
+    for seed in range(3):
+        world = random_world(seed, 0.08 * density)
+        assert build_roadmap(jax.random.key(seed), world, radius_m=RADIUS_M, config=config).samples == 150

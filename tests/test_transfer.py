@@ -10,8 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 import transfer as experiment
+from plots import draw_transfer
+from rows import TransferRow, read_rows
 
 from ct_envs import UserError, load_maze, stack_mazes
+from ct_jax.checkpoint import write_json
 from ct_jax.transfer import BODY, transfer
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 
@@ -77,9 +80,10 @@ def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path)
     with pytest.raises(UserError, match="other runs or pairs"):
         experiment.claim(tmp_path / "a" / "curve.json", {"episodes": 5, "point": tmp_path}, "runs or pairs")
     both = [
-        {"robot": robot, "run": "cpu-0", "start": "scratch", "source": None} | row
+        {"robot": robot, "run": "cpu-0", "start": "scratch", "source": None, "seed": 0} | row
         for robot in ("ant", "point")
         for row in rows
     ]
-    experiment.draw(both, tmp_path / "picture.png")
+    write_json(tmp_path / "both.json", {"rows": both})
+    draw_transfer(read_rows(tmp_path / "both.json", TransferRow), tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 0

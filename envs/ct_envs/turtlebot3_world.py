@@ -91,15 +91,19 @@ class World:
         raise UserError(f"no start and goal {apart_m} m apart in one free region; use fewer or smaller obstacles")
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
-        """Connected free regions, int [k], of points [k, 2] (m), told on a grid as ``reachable`` does."""
-        return _regions(self, radius - REGION_CELL_M * 2**-0.5).of(np.asarray(points, np.float64))
+        """Free regions, int [k], of points [k, 2] (m): a robot can cross the gaps inside one. 0 is no such region.
+
+        Told on a grid of 5 cm, in which gaps count as blocked that are up to 5 cm wider than the robot.
+        """
+        return _regions(self, radius + REGION_CELL_M / 2).of(np.asarray(points, np.float64))
 
     def reachable(self, start: np.ndarray, goal: np.ndarray, radius: float) -> bool:
         """Whether a robot may be able to go from start to goal [2] (m), where it can stand.
 
         Told on a grid of 5 cm, in which gaps count as free that are up to 7 cm too narrow; what can be reached is.
         """
-        start_label, goal_label = self.regions(np.asarray([start, goal]), radius)
+        ends = np.asarray([start, goal], np.float64)
+        start_label, goal_label = _regions(self, radius - REGION_CELL_M * 2**-0.5).of(ends)
         return bool(start_label == goal_label and start_label > 0)
 
     def covered(self) -> float:
