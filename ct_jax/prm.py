@@ -92,7 +92,7 @@ class Space(Protocol):
         ...
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
-        """Free regions, int [k], of points [k, 2] (m), that a robot of ``radius`` [m] can cross; 0 is no such region."""
+        """Free regions, int [k], of points [k, 2] (m), which a robot of ``radius`` [m] can cross; 0 is none."""
         ...
 
 
