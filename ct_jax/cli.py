@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
 INTERRUPTED = 130
-MAX_RANDOM_MAZES = 10_000
 ALL_SETTINGS = "--help-all"
 _stopped = False  # by a signal
 
@@ -439,6 +438,8 @@ def _train(command: Train) -> None:
 
 def _checked_count(mazes: int) -> int:
     """Raises UserError for a number of random mazes that means nothing."""
+    from ct_jax.presets import MAX_RANDOM_MAZES
+
     if not 0 <= mazes <= MAX_RANDOM_MAZES:
         raise UserError(f"--random-mazes {mazes}: give a number from 0 to {MAX_RANDOM_MAZES}")
     return mazes
@@ -485,19 +486,8 @@ def _evaluate(command: Evaluate) -> None:
         from ct_jax import pipeline
         from ct_jax.devices import is_first
 
-        names = (
-            "maze",
-            "episodes",
-            "horizon",
-            "engine",
-            "worlds",
-            "pairs",
-            "density",
-            "noise",
-            "optimism",
-            "picture",
-            "video",
-        )
+        names = ("maze", "episodes", "horizon", "engine", "worlds", "pairs", "density", "noise")
+        names += ("optimism", "picture", "video")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
 
         def keep(row: Row) -> None:

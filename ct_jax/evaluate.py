@@ -18,7 +18,7 @@ from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
 from ct_jax.devices import data_mesh, fill_up, joined, own
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import Conditioned
-from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend
+from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend_by_pairs
 from ct_jax.rollout import Controller, Guided, Policy, Steps, broke_off
 
 METHODS = ("ct", "planner", "explorer")
@@ -118,9 +118,9 @@ def shortest_ways(
 ) -> tuple[np.ndarray, int]:
     """Lengths [n] (m) of the shortest ways between starts and goals [n, 2] (m) on a roadmap, which grows until it joins
     them. Where it cannot, the straight line: a lower bound, for a strict SPL. And how many these are."""
-    roadmap = build_roadmap(key, space, radius_m=radius_m, config=config, ends=np.stack([start, goal], 1))
-    grown = extend(roadmap, np.stack([start, goal], 1).reshape(-1, 2))
-    shortest = grown.distances(len(roadmap.points) + np.arange(2 * len(start)).reshape(-1, 2))
+    ends = np.stack([start, goal], 1)
+    grown, nodes = extend_by_pairs(build_roadmap(key, space, radius_m=radius_m, config=config, ends=ends), ends)
+    shortest = grown.distances(nodes)
     unknown = ~np.isfinite(shortest)
     return np.where(unknown, np.linalg.norm(start - goal, axis=1), shortest), int(unknown.sum())
 
@@ -204,11 +204,9 @@ def _plans(key: jax.Array, env: MazeEnv, maze: Maze, pairs: Pairs, prm: PrmConfi
     """The planner's ways to the goals, with a leading axis of one, and how many starts and goals they do not join."""
     ends = np.stack([pairs.start, pairs.goal], 1)
     roadmap = build_roadmap(key, maze, radius_m=env.robot.radius_m, config=prm, ends=ends)
-    grown = extend(roadmap, ends.reshape(-1, 2))
-    nodes = len(roadmap.points) + np.arange(2 * len(ends)).reshape(-1, 2)
-    component = grown.components[nodes]
+    grown, nodes = extend_by_pairs(roadmap, ends)
     table = jax.tree.map(lambda leaf: leaf[None], grown.table_to(nodes[:, 1]))
-    return table, int((component[:, 0] != component[:, 1]).sum())
+    return table, int((~grown.are_joined(nodes)).sum())
 
 
 def _outcome(

@@ -113,7 +113,9 @@ def evaluate_rooms(
         for i, world in enumerate(worlds)
         if method in GUIDED
     ]
-    not_joined = [int((~joins(room.roadmap, ends[pairs.world == i])).sum()) for i, room in enumerate(rooms)]
+    not_joined = None
+    if method == "planner":
+        not_joined = sum(int((~joins(room.roadmap, ends[pairs.world == i])).sum()) for i, room in enumerate(rooms))
     drives: list[Drive] = []
     asked: list[np.ndarray] = []
     for first in range(0, len(pairs.start), pool.n):
@@ -133,7 +135,7 @@ def evaluate_rooms(
     horizon = pool.config.horizon
     return replace(
         _outcome(drives, pairs, time.perf_counter() - begun, np.concatenate(asked) if asked else None, horizon),
-        not_joined=sum(not_joined) if method == "planner" else None,
+        not_joined=not_joined,
         beyond=beyond_horizon(TURTLEBOT3, pairs, horizon),
     )
 

@@ -20,12 +20,12 @@ from ct_jax.files import check_writable, save_arrays
 from ct_jax.finetune import recover
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
+from ct_jax.presets import MAX_EPISODES
 from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, join_mazes, kept_row, slug, training
 from ct_jax.trajectories import Trajectories
 
-MAX_EPISODES = 100_000
 PICTURES = (".png", ".svg", ".pdf")
 _FAR_M = 1e6  # no maze is so large
 PAIR_ARRAYS = ("start", "goal", "shortest_m")  # and how many of the last are straight lines

@@ -18,6 +18,7 @@ from ct_jax.transformer import ModelConfig
 
 MAX_SEED = 2**32 - 1
 MAX_OPTIMISM = 10.0
+MAX_EPISODES, MAX_RANDOM_MAZES = 100_000, 10_000
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,11 @@ class Settings(Checked):
     last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
     optimism: Annotated[float, Above(0, MAX_OPTIMISM)] = 1.0  # k: ask for k * V (paper, sec. III-D)
     reprompt: bool = False  # never ask for more than V of the present state
-    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # so many mazes of a generator to collect and recover in,
+    random_mazes: Annotated[int, Within(0, MAX_RANDOM_MAZES)] = (
+        0  # so many mazes of a generator to collect and recover in,
+    )
     # besides the named ones
-    episodes: Annotated[int, Within(1, 100_000)] = 100  # start-goal pairs of the evaluation in each maze (paper)
+    episodes: Annotated[int, Within(1, MAX_EPISODES)] = 100  # start-goal pairs of the evaluation in each maze (paper)
     pairs_seed: Annotated[int, Within(0, MAX_SEED)] = 0  # their seed: not the run's, so that all models meet the same
     # pairs
     rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room

@@ -153,6 +153,11 @@ class Roadmap:
             distance=jnp.asarray(distance if all_pairs else distance.T, jnp.float32),
         )
 
+    def are_joined(self, pairs: Int[np.ndarray, "k 2"]) -> Bool[np.ndarray, "k"]:
+        """Whether there is a path between pairs of points."""
+        component = self.components[pairs]
+        return component[:, 0] == component[:, 1]
+
     def distances(self, pairs: Int[np.ndarray, "k 2"]) -> Float[np.ndarray, "k"]:
         """Lengths [m] of the shortest paths between pairs of points; inf where there is none."""
         return dijkstra(self._weights, indices=pairs[:, 0])[np.arange(len(pairs)), pairs[:, 1]].astype(np.float32)
@@ -228,9 +233,8 @@ def _suffices(roadmap: Roadmap, ends: np.ndarray | None) -> bool:
 
 def joins(roadmap: Roadmap, ends: Float[np.ndarray, "k 2 2"]) -> Bool[np.ndarray, "k"]:
     """Whether the roadmap has a path from each start to its goal [m]."""
-    grown = extend(roadmap, np.asarray(ends).reshape(-1, 2))
-    component = grown.components[len(roadmap.points) :].reshape(-1, 2)
-    return component[:, 0] == component[:, 1]
+    grown, nodes = extend_by_pairs(roadmap, ends)
+    return grown.are_joined(nodes)
 
 
 def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 2"]:
@@ -255,6 +259,12 @@ def draw_joined(key: jax.Array, roadmap: Roadmap, n: int) -> Int[np.ndarray, "n 
     skipped = number - (ends - others)[first]
     second = begin + skipped + (skipped >= place[first] - begin)
     return np.stack([first, order[second]], 1)
+
+
+def extend_by_pairs(roadmap: Roadmap, ends: Float[np.ndarray, "k 2 2"]) -> tuple[Roadmap, Int[np.ndarray, "k 2"]]:
+    """The roadmap with starts and goals [m] as points of their own, and the numbers of these points."""
+    points = np.asarray(ends).reshape(-1, 2)
+    return extend(roadmap, points), len(roadmap.points) + np.arange(len(points)).reshape(-1, 2)
 
 
 def extend(roadmap: Roadmap, points: np.ndarray) -> Roadmap:

@@ -209,7 +209,7 @@ class HeadingHead(nn.Module):
 
 
 class SkillHead(nn.Module):
-    """Actions of the low-level controller as it was learned, led by the trunk: to a point of the world's plane a mode.
+    """Actions of the trained low-level controller. For each mode, the trunk gives it a goal in the world's plane.
 
     For a body so easily brought down that a head of one's own, which learns a gait from examples, falls. The weights
     lie in the collection "skill", see ``with_skill``, and get no gradient.

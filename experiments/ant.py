@@ -9,28 +9,13 @@ takes longest on two cores; ``--controller zoo`` uses the shipped one. ``zoo:ant
 ``experiments/results/ant-PRESET.json``.
 """
 
+from overrides import BC, CALM, CT, LONG, LONG_CT, MAZES, MAZES_CT, MODES, MODES_CT, ROAM
 from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
-BC = {"model.returns": False}
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 40, "round_fit": half_the_updates}
-# Without fine-tuning: all updates of the last training at once, with timesteps shifted at random.
-CT = {"rounds": 0, "fit.updates": 2500, "fit.warmup": 20, "fit.decay": True, "fit.shift_timestep": 300}
-LONG_CT = CT | {"fit.updates": 5000}
-LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
-MODES_CT = CT | {"model.modes": 4}
-MODES = {"model.modes": 4, "model.commitment": 3.0}  # Commitment only for models that learned from failures.
-CALM = {"controller_effort": 0.75}  # share of the controller's range: the ant falls less; chosen in the training maze
 MEMORY = {"model.stride": 3}  # the same number of steps in memory, farther apart
 # The action head is the fixed low-level controller. It has one gait, so data are only rotated, not reflected.
 SKILL = {"model.skill": True, "fit.turns": True, "round_fit.turns": True, "last_fit.turns": True}
-ROAM = {"recover.random_mazes": 100}  # CT trained in one maze; recoveries also from random mazes
-# Also trajectories and recoveries from 100 random mazes. CT and F-CT have the same total number of updates.
-MAZES = {
-    "random_mazes": 100, "collect.trajectories": 2500, "collect.reset_interval": 10, "rounds": 6,
-    "fit.updates": 600, "fit.shift_timestep": 300, "round_fit.updates": 200, "round_fit.shift_timestep": 300,
-    "last_fit.updates": 2400, "last_fit.shift_timestep": 300,
-}  # fmt: skip
-MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
 
 SHIPPED = "calm-ct"  # the variant of zoo:ant
 
