@@ -15,15 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
+import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 import ct_envs.quiet  # noqa: F401
+from ct_jax import devices
+from ct_jax.cli import guarded, leave
 from ct_jax.compilation import keep_programs
+from ct_jax.files import prepare_outputs, write_text
 from ct_jax.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
@@ -94,11 +98,26 @@ def _spread(values: list[float]) -> dict[str, float]:
     return {"median": statistics.median(values), "min": min(values), "max": max(values)}
 
 
+def command_line(main: Callable[[Any], None], options: type[Options], docstring: str | None) -> NoReturn:
+    """Run a benchmark from the command line, and end the program."""
+
+    def run() -> None:
+        chosen = tyro.cli(options, description=docstring)
+        devices.check_flags()
+        devices.start_backend()
+        main(chosen)
+
+    leave(guarded(run))
+
+
 class Results:
     """Rows of one benchmark, ``file``."""
 
     def __init__(self, file: str, options: Options):
-        self.file, self.options = Path(file), options
+        self.options = options
+        self.file = RESULTS / f"{Path(file).stem}{'' if jax.default_backend() == 'cpu' else '-gpu'}.json"
+        if options.write:
+            prepare_outputs(self.file)
         self._rows: list[dict[str, Any]] = []
         self._made = provenance()  # before anything is written
         self._made["commit"] = os.environ.get(COMMIT) or self._made["commit"]
@@ -148,11 +167,8 @@ class Results:
         rows = [row | {"made": self._made} for row in self._rows]
         print(table_of(rows))
         if self.options.write:
-            RESULTS.mkdir(exist_ok=True)
-            on_cpu = jax.default_backend() == "cpu"
-            file = RESULTS / f"{self.file.stem}{'' if on_cpu else '-gpu'}.json"
-            file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-            print(f"results: {file}\npage:    python experiments/pages.py writes it to docs/speed.md")
+            write_text(self.file, json.dumps(rows, indent=1) + "\n")
+            print(f"results: {self.file}\npage:    python experiments/pages.py writes it to docs/speed.md")
 
 
 def _installed(name: str) -> bool:

@@ -16,8 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from _harness import Contestant, Options, Results, has_peer
+from _harness import Contestant, Options, Results, command_line, has_peer
 
 from ct_jax.presets import get_preset
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache, sample_inputs
@@ -137,4 +136,4 @@ def peer(config: ModelConfig, inputs: dict[str, np.ndarray]) -> Contestant:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(ActingOptions, description=__doc__))
+    command_line(main, ActingOptions, __doc__)

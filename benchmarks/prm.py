@@ -17,8 +17,7 @@ from typing import Any
 import jax
 import networkx as nx
 import numpy as np
-import tyro
-from _harness import Contestant, Options, Results, has_peer
+from _harness import Contestant, Options, Results, command_line, has_peer
 
 from ct_envs import load_maze
 from ct_envs.maze import Maze
@@ -249,4 +248,4 @@ class OmplPlanner:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(PrmOptions, description=__doc__))
+    command_line(main, PrmOptions, __doc__)

@@ -20,8 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from _harness import Contestant, Options, Results, has_peer
+from _harness import Contestant, Options, Results, command_line, has_peer
 from mujoco import mjx
 from mujoco.batch import Batch
 
@@ -275,4 +274,4 @@ def collection(robot: str, options: RolloutOptions, results: Results) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(RolloutOptions, description=__doc__))
+    command_line(main, RolloutOptions, __doc__)

@@ -19,8 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from _harness import Contestant, Options, Results, has_peer
+from _harness import Contestant, Options, Results, command_line, has_peer
 from flax import struct
 
 from ct_envs import MazeEnv, Tasks, load_maze
@@ -256,4 +255,4 @@ def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(SacOptions, description=__doc__))
+    command_line(main, SacOptions, __doc__)

@@ -24,11 +24,13 @@ from transformer import trajectories
 
 from ct_envs import UserError, load_maze, stack_mazes
 from ct_envs.robots import get_robot
-from ct_jax.cli import guarded
+from ct_jax.cli import guarded, leave
 from ct_jax.devices import replicated, sharded
+from ct_jax.files import prepare_outputs, write_text
 from ct_jax.fit import Fit, transformer_loss
 from ct_jax.model import sizes
 from ct_jax.presets import Settings, get_preset
+from ct_jax.terminal import printable
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
@@ -319,15 +321,16 @@ def breaks(plans: list[Plan], options: ScaleOptions, settings: Settings, assumed
 
 def main(options: ScaleOptions) -> None:
     """Write the page. Raises UserError where something was not measured."""
+    prepare_outputs(options.page)
     settings = get_preset(options.preset, options.robot)
     settings = replace(settings, collect=get_preset("cpu", options.robot).collect)
     found = measured(options, settings.prm.samples)
     text = write(options, settings, found, weigh(options.robot, settings), Assumed())
-    options.page.write_text(text, "utf-8")
-    print(options.page)
+    write_text(options.page, text)
+    print(printable(options.page))
 
 
 if __name__ == "__main__":
     os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")  # for XLA to have messages to count
     chosen = tyro.cli(ScaleOptions, description=__doc__)
-    raise SystemExit(guarded(lambda: main(chosen)))
+    leave(guarded(lambda: main(chosen)))

@@ -16,8 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
-from _harness import Contestant, Options, Results, has_peer
+from _harness import Contestant, Options, Results, command_line, has_peer
 
 from ct_envs import load_maze, stack_mazes
 from ct_envs.robots import get_robot
@@ -136,4 +135,4 @@ def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant
 
 
 if __name__ == "__main__":
-    main(tyro.cli(TransformerOptions, description=__doc__))
+    command_line(main, TransformerOptions, __doc__)

@@ -107,6 +107,13 @@ def check_writable(*files: Path, option: str = "") -> None:
             raise UserError(_cannot_be_written(file, bad, option)) from None
 
 
+def prepare_outputs(*files: Path) -> None:
+    """Make the folders of files, and try whether they could be written, before the work. Raises UserError."""
+    for file in files:
+        make_folder(file.parent, parents=True)
+    check_writable(*files)
+
+
 def check_folders(folder: Path) -> None:
     """Raises UserError for a link to a folder anywhere inside: what is written there would leave it."""
     for where, names, _ in os.walk(folder):

@@ -8,7 +8,6 @@ command, commit and machine that made it; its success on held-out edges during i
 """
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import ct_envs.quiet  # noqa: F401
 from ct_envs import UserError
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.cli import guarded, leave
+from ct_jax.files import prepare_outputs, whole
 
 ZOO = Path(__file__).parents[1] / "ct_jax" / "zoo" / "controllers"
 
@@ -41,9 +41,11 @@ def ship(run: Path) -> None:
     if not (folder / "done.json").is_file():
         raise UserError(f"{run}: has no finished controller of its own; train one, or continue the run with --resume")
     robot = read_json(folder / "controller.json")["robot"]
-    (ZOO / robot).mkdir(exist_ok=True)
-    shutil.copy(folder / "weights.safetensors", ZOO / robot)
-    write_json(ZOO / robot / "controller.json", described(run))
+    weights, description = ZOO / robot / "weights.safetensors", ZOO / robot / "controller.json"
+    prepare_outputs(weights, description)
+    with whole(weights) as opened:
+        opened.write((folder / "weights.safetensors").read_bytes())
+    write_json(description, described(run))
 
 
 def described(run: Path) -> dict[str, Any]:

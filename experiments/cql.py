@@ -17,8 +17,10 @@ from study import Study, load_variants, pt_cql
 
 from ct_envs import UserError
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
+from ct_jax.files import prepare_outputs
 
 TUNING_SEED = 7  # of the pairs
+FILE = RESULTS / "cql.json"
 VARIED = ("alpha", "target_rate", "reward_scale", "imitation", "updates")
 
 
@@ -48,6 +50,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Try all choices; write each result as soon as it is measured."""
+    prepare_outputs(FILE)
     prepare_jax()
     variants = load_variants(options.robot)
     if "pt-cql" not in variants:
@@ -68,7 +71,7 @@ def main(options: Options) -> None:
 
 def keep(rows: list[CqlRow]) -> None:
     """Write rows to the results file, replacing rows with the same settings, and print all rows of the robot."""
-    kept = replace_rows(RESULTS / "cql.json", rows, ("robot", *VARIED), CqlRow)
+    kept = replace_rows(FILE, rows, ("robot", *VARIED), CqlRow)
     short = lambda row: " ".join(f"{name[0]}{getattr(row, name):g}" for name in VARIED)  # noqa: E731
     print_rows([row.values() | {"method": short(row)} for row in kept if row.robot == rows[0].robot])
 

@@ -19,6 +19,7 @@ from study import as_digits, digest_arrays, load_variants
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.files import prepare_outputs
 from ct_jax.model import load_model
 from ct_jax.progress import Bar
 from ct_jax.run import provenance
@@ -78,6 +79,7 @@ def before_of(options: Options) -> str:
 
 def main(options: Options) -> None:
     """Measure all seeds and mazes; write each pair of rows as soon as it is measured."""
+    prepare_outputs(FILE)
     prepare_jax()
     variants = (before_of(options), options.tuned)
     for seed in options.seeds:
@@ -85,8 +87,8 @@ def main(options: Options) -> None:
             before, after = (measure(options, variant, seed, maze) for variant in variants)
             if before.controller != after.controller:
                 raise UserError(f"the models of seed {seed} have different low-level controllers; train both again")
-            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"), Row)
             print_rows([row.values() | {"method": row.variant} for row in (before, after)])
+            replace_rows(FILE, [before, after], ("robot", "maze", "variant", "model_seed", "controller"), Row)
 
 
 if __name__ == "__main__":

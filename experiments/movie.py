@@ -20,6 +20,7 @@ from ct_envs import Maze, MazeEnv, UserError, load_maze
 from ct_envs.maze import unpadded
 from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.files import check_writable, whole
 from ct_jax.model import load_model
 from ct_jax.report.video import check_video, write_video
 
@@ -75,8 +76,9 @@ def draw_map(maze: Maze, path: np.ndarray, goal: np.ndarray, height: int) -> Ima
 
 def main(options: Options) -> None:
     """Film one episode. Raises UserError if the model does not reach its goal."""
-    if options.out.suffix != ".gif" or not options.out.parent.is_dir():
-        raise UserError(f"--out {options.out}: give a .gif file in a folder that exists")
+    if options.out.suffix != ".gif":
+        raise UserError(f"--out {options.out}: give a .gif file")
+    check_writable(options.out, option="--out")
     prepare_jax()
     model, maze = load_model(options.run), load_maze(options.maze)
     env = MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
@@ -99,7 +101,9 @@ def main(options: Options) -> None:
         pictures.append(beside(frame, draw_map(maze, so_far, pairs.goal[0], options.height)))
     ms = round(1000 * steps * robot.control_dt_s / len(filmed) / options.speed)
     durations = [ms] * (len(pictures) - 1) + [2000]  # pause at the end
-    pictures[0].save(options.out, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
+    more = {"append_images": pictures[1:], "duration": durations, "loop": 0, "optimize": True}
+    with whole(options.out) as opened:
+        pictures[0].save(opened, "gif", save_all=True, **more)
     print(f"{options.out}: {len(pictures)} pictures, {options.out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -8,7 +8,6 @@ docs/results are drawn anew, too.
 """
 
 import json
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,9 @@ from tables import (
     summary_table,
     transfer_table,
 )
+
+from ct_jax.cli import guarded, leave
+from ct_jax.files import prepare_outputs, write_text
 
 ROOT = Path(__file__).parents[1]
 BENCHMARKS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs"
@@ -254,15 +256,15 @@ def plots() -> dict[Path, Callable[[], None]]:
     return drawn
 
 
-def main() -> int:
+def main() -> None:
     """Write all pages and plots."""
-    PAGES.mkdir(parents=True, exist_ok=True)
-    for file, text in pages().items():
-        file.write_text(text, "utf-8")
-    for draw in plots().values():
+    texts, drawn = pages(), plots()
+    prepare_outputs(*texts, *drawn)
+    for file, text in texts.items():
+        write_text(file, text)
+    for draw in drawn.values():
         draw()
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(guarded(main))

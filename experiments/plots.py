@@ -10,6 +10,8 @@ from intervals import rate_of
 from matplotlib.figure import Figure
 from rows import CT, Row, TransferRow
 
+from ct_jax.files import whole
+
 HELD_OUT_ENOUGH = 0.97  # success on held-out edges that counts as good
 
 
@@ -48,7 +50,7 @@ def draw_sweep(rows: Sequence[Row], axis: str, label: str, file: Path) -> None:
     ax.set(xlabel=label, ylabel="success [%]", ylim=(max(0.0, 10 * np.floor(lowest / 10 - 0.5)), 101))
     ax.grid(alpha=0.3)
     ax.legend()
-    figure.savefig(file, dpi=150)
+    _save(figure, file)
 
 
 def draw_transfer(rows: Sequence[TransferRow], file: Path) -> None:
@@ -73,7 +75,7 @@ def draw_transfer(rows: Sequence[TransferRow], file: Path) -> None:
         ax.minorticks_off()
         ax.legend(loc="best", frameon=False)
     axes[0].set_ylabel("success in the unseen maze [%]")
-    figure.savefig(file, dpi=150)
+    _save(figure, file)
 
 
 def draw_controllers(controllers: Sequence[Mapping[str, Any]], file: Path) -> None:
@@ -89,4 +91,9 @@ def draw_controllers(controllers: Sequence[Mapping[str, Any]], file: Path) -> No
     ax.grid(alpha=0.3)
     ax.xaxis.set_major_formatter("{x:g}")
     figure.legend(loc="outside upper center")
-    figure.savefig(file, dpi=150)
+    _save(figure, file)
+
+
+def _save(figure: Figure, file: Path) -> None:
+    with whole(file) as opened:
+        figure.savefig(opened, format="png", dpi=150)

@@ -31,6 +31,7 @@ from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
+from ct_jax.files import prepare_outputs
 from ct_jax.finetune import NoRecoveryError
 from ct_jax.mazes import evaluated
 from ct_jax.model import load_controller
@@ -47,6 +48,7 @@ from ct_jax.run import (
     provenance,
     training,
 )
+from ct_jax.terminal import printable
 
 SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
 
@@ -171,6 +173,7 @@ def main(robot: str, variants: Mapping[str, Variant], docstring: str | None) -> 
     def run() -> None:
         options = tyro.cli(MazeOptions, description=about(docstring, variants))
         file = RESULTS / f"{robot}-{options.preset}.json"
+        prepare_outputs(file)
         study = Study(
             robot=robot, preset=options.preset, out=options.out or Path("runs") / robot, engine=options.engine,
             controller=options.controller,
@@ -229,17 +232,17 @@ class Study:
         for seed in seeds:
             for name, variant in variants.items():
                 run = self.make_run(name, variant, seed)
-                print(f"== {self.robot}: {name}, seed {seed}, in {run.folder}", file=sys.stderr)
+                print(printable(f"== {self.robot}: {name}, seed {seed}, in {run.folder}"), file=sys.stderr)
                 try:
                     share(runs, run)
                     rows = measure(run, name, variant)
                 except NoRecoveryError as none:
-                    print(f"{run.folder}: {none}", file=sys.stderr)
+                    print(printable(f"{run.folder}: {none}"), file=sys.stderr)
                     found.unmade.append(Unmade(**made_of(run, name, CT), why=str(none)))
                     keep(found)
                     continue
                 except UserError as bad:  # the other runs can still succeed
-                    print(f"{run.folder}: {bad}", file=sys.stderr)
+                    print(printable(f"{run.folder}: {bad}"), file=sys.stderr)
                     failed.append(f"{run.folder}: {bad}")
                     continue
                 if reference(run) in map(reference, runs):

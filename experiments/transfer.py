@@ -25,6 +25,7 @@ from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.files import prepare_outputs
 from ct_jax.fit import Fit, fit, init_params
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.progress import Bar
@@ -145,6 +146,7 @@ def measure(options: Options) -> list[TransferRow]:
 
 def main(options: Options) -> None:
     """Run the experiment."""
+    prepare_outputs(FILE)
     prepare_jax()
     replace_rows(FILE, measure(options), ("robot", "run", "start", "source", "seed", "updates"), TransferRow)
     print(f"results: {FILE}\npages:   python experiments/pages.py writes them to docs/results")

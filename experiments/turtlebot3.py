@@ -26,6 +26,7 @@ from study import Options, Study, Variant, about, choose, keep_once, label, show
 
 from ct_jax.cli import guarded, leave
 from ct_jax.evaluate import GUIDED
+from ct_jax.files import make_folder, prepare_outputs
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
 from ct_jax.run import Run
@@ -70,6 +71,7 @@ class RoomOptions(Options):
 def run_all(options: RoomOptions) -> Path:
     """Train and evaluate everything with each seed, and continue unfinished runs; returns the results file."""
     file = RESULTS / f"turtlebot3-{options.preset}.json"
+    prepare_outputs(file)
     chosen = choose(VARIANTS, options.preset, options.variants)
     study = Study(robot="turtlebot3", preset=options.preset, out=options.out)
     study.run(chosen, options.seeds, lambda found: add_results(file, found))
@@ -85,7 +87,7 @@ def sweep(run: Run, name: str, kinds: tuple[str, ...], *, references: bool) -> I
     """Rows of the given kinds: other densities, levels of noise, and the seven pairs."""
     model, settings = load_model(str(run.folder)), run.settings
     kept, seed = run.folder / "sweeps", settings.pairs_seed
-    kept.mkdir(exist_ok=True)
+    make_folder(kept)
     assert settings.rooms is not None
     where = {"worlds": settings.rooms.worlds, "pairs": min(SWEPT_PAIRS, settings.episodes)}
     for method in (CT, *(GUIDED if references else ())):

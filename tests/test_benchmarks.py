@@ -3,7 +3,9 @@
 import ast
 import itertools
 import json
+import os
 import pathlib
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -223,3 +225,20 @@ def test_more_hosts_hold_less_and_say_more(tmp_path):
     assert one.rollouts == pytest.approx(options.trajectories / (10.0 / 2 * assumed.cores))
     loads = [limit.load for limit in scale.limits(many, options, settings, assumed)]
     assert loads == sorted(loads, reverse=True)
+
+
+def test_results_that_cannot_be_written_are_told_before_anything_is_timed(tmp_path, monkeypatch):
+    (tmp_path / "results").write_text("mine")
+    with pytest.raises(UserError, match=f"^{tmp_path / 'results'}: cannot be written"):
+        results(tmp_path, monkeypatch)
+    results(tmp_path, monkeypatch, write=False)
+
+
+def test_a_benchmark_without_a_device_is_one_line(tmp_path):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "nonsense"}
+    command = [sys.executable, str(BENCHMARKS / "prm.py"), "--no-write"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert (
+        done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("error: JAX finds no device")
+    )
+    assert list(tmp_path.iterdir()) == []

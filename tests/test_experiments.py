@@ -1,5 +1,6 @@
 """The experiments: what their variants are, that all rows are made once and kept, and that the pages show them."""
 
+import importlib
 import re
 import shutil
 import sys
@@ -533,3 +534,31 @@ def test_every_marker_has_its_pair():
         opened = re.findall(r"^<!-- ([\w-]+) -->$", file.read_text("utf-8"), re.MULTILINE)
         closed = re.findall(r"^<!-- /([\w-]+) -->$", file.read_text("utf-8"), re.MULTILINE)
         assert opened == closed, file
+
+
+@pytest.mark.parametrize("name", ["cql", "finetuned", "transfer"])
+def test_a_results_file_that_cannot_be_written_is_told_before_the_work(name, tmp_path, monkeypatch):
+    script = importlib.import_module(name)
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.setattr(script, "prepare_jax", lambda: pytest.fail("it began"))
+    monkeypatch.setattr(script, "FILE", tmp_path / "file" / "results.json")
+    with pytest.raises(UserError, match=f"^{tmp_path / 'file'}: cannot be written"):
+        script.main(script.Options())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("name", ["point", "turtlebot3"])
+def test_a_study_whose_results_cannot_be_written_is_told_before_the_work(name, tmp_path, monkeypatch, capsys):
+    script = importlib.import_module(name)
+    (tmp_path / f"{name}-cpu.json").mkdir()
+    monkeypatch.setattr(Study, "run", lambda *_: pytest.fail("it began"))
+    monkeypatch.setattr(sys, "argv", [name])
+    for module in (study, script):
+        monkeypatch.setattr(module, "RESULTS", tmp_path, raising=False)
+    if name == "point":
+        with pytest.raises(SystemExit) as stop:
+            study.main(name, {}, "")
+        assert stop.value.code == 2 and "cannot be written (Is a directory)" in capsys.readouterr().err
+    else:
+        with pytest.raises(UserError, match=r"cannot be written \(Is a directory\)"):
+            script.run()
