@@ -7,7 +7,7 @@ from torch import nn  # pyright: ignore[reportMissingImports]
 from transformers import DecisionTransformerConfig, DecisionTransformerModel  # pyright: ignore
 
 from ct_jax.run import cores
-from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, ModelConfig
+from ct_jax.transformer import GOAL_SCALE_M, RETURN_DIVISOR, ModelConfig
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 torch.set_num_threads(cores())
@@ -37,13 +37,13 @@ class PeerTransformer(nn.Module):
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Actions [B, S, A] of pieces of trajectories."""
-        goal, maps = batch["goal"], batch["map"].float()
+        goal, maps = batch["goal_relative"], batch["map"].float()
         distance = goal.norm(dim=-1, keepdim=True)
         features = torch.cat([goal / GOAL_SCALE_M, torch.tanh(goal / 2.0), goal / (distance + 0.1)], -1)
         seen = self.encode_map(maps.flatten(0, 1)).unflatten(0, maps.shape[:2])
         return self.trunk(
             states=torch.cat([seen, batch["proprio"], self.embed_goal(features)], -1), actions=batch["action"],
-            returns_to_go=batch["rtg"][..., None] / RETURN_SCALE, timesteps=batch["timestep"],
+            returns_to_go=batch["rtg"][..., None] / RETURN_DIVISOR, timesteps=batch["timestep"],
             attention_mask=batch["valid"],
         ).action_preds  # fmt: skip
 
@@ -64,7 +64,7 @@ class PeerTraining:
         """Some updates."""
         for _ in range(updates):
             with torch.autocast(DEVICE, torch.bfloat16, enabled=self._bf16):
-                error = (self._model(self._batch) - self._batch["target"]).float() ** 2
+                error = (self._model(self._batch) - self._batch["label"]).float() ** 2
             loss = (error.mean(-1) * self._batch["valid"]).sum() / self._batch["valid"].sum()
             self._optimizer.zero_grad()
             loss.backward()

@@ -140,7 +140,7 @@ class Learner:
         """What is learned so far."""
         config, state = self.sac.config, self.state
         return SacController(
-            state.normalizer, state.average, self.env.action_size, config.hidden, config.frame, config.effort
+            state.normalizer, state.average, self.env.action_size, config.hidden, config.frame, config.action_scale
         )
 
     def success(self, controller: Any) -> float:
@@ -212,7 +212,7 @@ def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
 
     @jax.jit
     def step(state: Any, action: jax.Array) -> tuple[Any, ...]:
-        after = jax.vmap(env.step)(state, sac.config.effort * action)
+        after = jax.vmap(env.step)(state, sac.config.action_scale * action)
         return after, sac._observe(after), sac._reward(state, action, after), after.done
 
     class Environments(VecEnv):

@@ -29,7 +29,8 @@ from ct_jax.devices import replicated, sharded
 from ct_jax.files import prepare_outputs, write_text
 from ct_jax.fit import Fit, transformer_loss
 from ct_jax.model import sizes
-from ct_jax.presets import Settings, get_preset
+from ct_jax.presets import get_preset
+from ct_jax.settings import Settings
 from ct_jax.terminal import printable
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
@@ -213,7 +214,7 @@ class Limit(NamedTuple):
 
     what: str
     load: float  # what is asked of it, in what there is
-    mend: str
+    hint: str
 
 
 def limits(each: Plan, options: ScaleOptions, settings: Settings, assumed: Assumed) -> list[Limit]:
@@ -316,7 +317,7 @@ def breaks(plans: list[Plan], options: ScaleOptions, settings: Settings, assumed
     for each in plans:
         yield f"\n{each.hosts} host{'s' * (each.hosts > 1)}:\n\n| what | load | what to do |\n|---|---|---|"
         for limit in limits(each, options, settings, assumed):
-            yield f"| {limit.what} | {limit.load:.3g} | {limit.mend if limit.load > 0.5 else ''} |"
+            yield f"| {limit.what} | {limit.load:.3g} | {limit.hint if limit.load > 0.5 else ''} |"
 
 
 def main(options: ScaleOptions) -> None:

@@ -98,11 +98,11 @@ def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Traje
     place = lambda *shape: jax.random.uniform(next(keys), (*shape, 2), minval=4.0, maxval=30.0)  # noqa: E731
     seen = {}
     if get_robot(robot).course == "room":
-        seen = {"seen": normal(2), "map_bits": jax.random.bits(next(keys), (n, steps, 157), jnp.uint8)}
+        seen = {"goal_relative": normal(2), "map_bits": jax.random.bits(next(keys), (n, steps, 157), jnp.uint8)}
     return Trajectories(
         position=place(n, steps), proprio=normal(proprio),
-        action=jnp.tanh(normal(action)), target=jnp.tanh(normal(action)), reward=-jnp.abs(normal()),
-        learn=jnp.ones((n, steps)), collision=jnp.zeros((n, steps)), goal=place(n),
+        action=jnp.tanh(normal(action)), label=jnp.tanh(normal(action)), reward=-jnp.abs(normal()),
+        label_mask=jnp.ones((n, steps)), collision=jnp.zeros((n, steps)), goal_world=place(n),
         maze=jnp.zeros(n, jnp.int32), length=jnp.full(n, steps, jnp.int32), **seen,
     )  # fmt: skip
 
@@ -126,7 +126,7 @@ def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant
     """The peer's training on such a window."""
     from _decision_transformer import PeerTraining, PeerTransformer, batch_of
 
-    names = ("map", "proprio", "goal", "action", "target", "rtg", "timestep", "valid")
+    names = ("map", "proprio", "goal_relative", "action", "label", "rtg", "timestep", "valid")
     batch = batch_of(**{name: np.asarray(getattr(window, name)) for name in names})
     batch["timestep"] = batch["timestep"].long()
     sizes = (window.proprio.shape[-1], window.action.shape[-1], window.rtg.shape[1])

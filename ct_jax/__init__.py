@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from ct_jax.model import load_model as load
     from ct_jax.pipeline import evaluate_model, train
     from ct_jax.policy import TransformerPolicy
-    from ct_jax.presets import Settings, get_preset
+    from ct_jax.presets import get_preset
     from ct_jax.prm import PrmConfig
     from ct_jax.rollout import Controller, Guide, Policy
     from ct_jax.run import Run
+    from ct_jax.settings import Settings
     from ct_jax.trajectories import Trajectories
     from ct_jax.transformer import ControlTransformer, ModelConfig
 
@@ -45,7 +46,8 @@ _NAMES = {
     "ct_jax.fit": ("FitConfig", "ValueConfig"),
     "ct_jax.pipeline": ("evaluate_model", "train"),
     "ct_jax.policy": ("TransformerPolicy",),
-    "ct_jax.presets": ("Settings", "get_preset"),
+    "ct_jax.presets": ("get_preset",),
+    "ct_jax.settings": ("Settings",),
     "ct_jax.prm": ("PrmConfig",),
     "ct_jax.rollout": ("Controller", "Guide", "Policy"),
     "ct_jax.run": ("Run",),

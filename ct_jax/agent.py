@@ -61,7 +61,7 @@ class Agent:
         state = self._state(observation, reward)
         self._check_memory(memory, state)
         action, memory = act(self.policy, memory, state, jax.random.key(0))
-        return action.done, memory
+        return action.executed, memory
 
     def _state(self, observation: Mapping[str, Any], reward: Any = None) -> State:
         """What a policy needs of a brax state. Raises UserError."""

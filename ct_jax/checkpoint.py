@@ -265,19 +265,19 @@ def _is_finite(array: np.ndarray) -> bool:
     return not np.issubdtype(array.dtype, np.inexact) or bool(np.isfinite(array).all())
 
 
-def load_weights(file: Path, like: Tree, *, mend: str = "train again or fetch it anew") -> Tree:
+def load_weights(file: Path, like: Tree, *, hint: str = "train again or fetch it anew") -> Tree:
     """Read weights into the structure of ``like``.
 
     Args:
-        mend: what the error tells a person to do about a damaged file.
+        hint: what the error tells a person to do about a damaged file.
 
     Raises:
         UserError: as ``read_weights`` and ``arrange_weights``.
     """
-    return arrange_weights(file, read_weights(file, mend=mend), like, mend=mend)
+    return arrange_weights(file, read_weights(file, hint=hint), like, hint=hint)
 
 
-def read_weights(file: Path, *, of: Any = None, bound: bool = True, mend: str) -> dict[str, np.ndarray]:
+def read_weights(file: Path, *, of: Any = None, bound: bool = True, hint: str) -> dict[str, np.ndarray]:
     """The arrays that ``save_weights`` wrote, by name.
 
     Args:
@@ -292,18 +292,18 @@ def read_weights(file: Path, *, of: Any = None, bound: bool = True, mend: str) -
             found, said = {name: opened.get_tensor(name) for name in opened.keys()}, opened.metadata() or {}  # noqa: SIM118
     # NumPy has not all of safetensors' types (AttributeError), nor as many dimensions (ValueError).
     except (OSError, SafetensorError, AttributeError, TypeError, ValueError) as bad:
-        raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {mend}") from None
+        raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {hint}") from None
     if "sha256" not in said:
-        raise UserError(f"{file}: without its SHA-256 sum; {mend}")
+        raise UserError(f"{file}: without its SHA-256 sum; {hint}")
     whole, _, described = said["sha256"].partition(" ")
     if whole != _sum_of_arrays(found):
-        raise UserError(f"{file}: not as it was written (SHA-256); {mend}")
+        raise UserError(f"{file}: not as it was written (SHA-256); {hint}")
     if of is not None and (bound or described) and described != _digest(of):
-        raise UserError(f"{file}: weights of another model than the one described beside it; {mend}")
+        raise UserError(f"{file}: weights of another model than the one described beside it; {hint}")
     return found
 
 
-def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, mend: str) -> Tree:
+def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, hint: str) -> Tree:
     """The arrays of a file in the structure of ``like``.
 
     Raises:
@@ -312,17 +312,17 @@ def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, men
     wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(like)}
     for name, leaf in wanted.items():
         if name not in found:
-            raise UserError(f"{file}: holds no weights '{name}'; it belongs to another model; {mend}")
+            raise UserError(f"{file}: holds no weights '{name}'; it belongs to another model; {hint}")
         for what, is_, needed in (
             ("shape", found[name].shape, np.shape(leaf)), ("type", found[name].dtype, leaf.dtype),
         ):  # fmt: skip
             if is_ != needed:
-                raise UserError(f"{file}: '{name}' has {what} {is_}, this model needs {needed}; {mend}")
+                raise UserError(f"{file}: '{name}' has {what} {is_}, this model needs {needed}; {hint}")
         if not _is_finite(found[name]):
-            raise UserError(f"{file}: '{name}' is not finite everywhere; {mend}")
+            raise UserError(f"{file}: '{name}' is not finite everywhere; {hint}")
     for name in found:
         if name not in wanted:
-            raise UserError(f"{file}: holds weights {shown(name)} besides; it belongs to another model; {mend}")
+            raise UserError(f"{file}: holds weights {shown(name)} besides; it belongs to another model; {hint}")
     return jax.tree_util.tree_map_with_path(lambda path, leaf: found[_name(path)], like)
 
 
@@ -335,24 +335,24 @@ def write_json(file: Path, value: Any) -> None:
     write_text(file, text + "\n")
 
 
-def read_json(file: Path, *, mend: str = "delete it and run again") -> dict[str, Any]:
+def read_json(file: Path, *, hint: str = "delete it and run again") -> dict[str, Any]:
     """Read a JSON object. Raises UserError naming the file, the line and the mend."""
     try:
         found = json.loads(file.read_text("utf-8"), parse_constant=_finite, parse_float=_finite)
     except FileNotFoundError:
         raise UserError(f"{file}: no such file") from None
     except json.JSONDecodeError as bad:
-        raise UserError(f"{file}:{bad.lineno}: not JSON ({bad.msg}); {mend}") from None
+        raise UserError(f"{file}:{bad.lineno}: not JSON ({bad.msg}); {hint}") from None
     except UnicodeDecodeError:
-        raise UserError(f"{file}: not UTF-8 text; {mend}") from None
+        raise UserError(f"{file}: not UTF-8 text; {hint}") from None
     except RecursionError:
-        raise UserError(f"{file}: nested too deep to be read; {mend}") from None
+        raise UserError(f"{file}: nested too deep to be read; {hint}") from None
     except ValueError as bad:  # a whole number of thousands of digits, or one of ``_finite``
-        raise UserError(f"{file}: {str(bad).partition(';')[0]}; {mend}") from None
+        raise UserError(f"{file}: {str(bad).partition(';')[0]}; {hint}") from None
     except OSError as bad:
         raise UserError(f"{file}: cannot be read ({bad.strerror})") from None
     if not isinstance(found, dict):
-        raise UserError(f"{file}:1: not a JSON object; {mend}")
+        raise UserError(f"{file}:1: not a JSON object; {hint}")
     return found
 
 

@@ -35,7 +35,7 @@ from ct_jax.terminal import check_stdout, one_line, printable, show_anything
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ct_jax.presets import Settings
+    from ct_jax.settings import Settings
 
 PROGRAM = "ct-jax"
 BAD_INPUT = 2
@@ -123,7 +123,7 @@ class Evaluate:
       ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
       ct-jax evaluate zoo:ant --maze unseen-rooms --episodes 1 --seed 3 --video rooms.mp4
       ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
-      ct-jax evaluate zoo:point --seed 7 --optimism 0.75
+      ct-jax evaluate zoo:point --seed 7 --return_scale 0.75
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
@@ -147,7 +147,7 @@ class Evaluate:
     """Seed of the pairs; the same pairs for every method."""
     method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
     """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
-    optimism: Annotated[float | None, arg(metavar="K", help_behavior_hint="(default: the model's)")] = None
+    return_scale: Annotated[float | None, arg(metavar="K", help_behavior_hint="(default: the model's)")] = None
     """The transformer asks for K times the return that the value network predicts; returns are negative, so less than 1
     asks to be quicker."""
     engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
@@ -309,7 +309,7 @@ def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
 
 def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
     """The preset's settings with those that were given in their place."""
-    from ct_jax.presets import Settings
+    from ct_jax.settings import Settings
 
     def parse() -> Settings:
         return tyro.cli(
@@ -438,7 +438,7 @@ def _train(command: Train) -> None:
 
 def _checked_count(mazes: int) -> int:
     """Raises UserError for a number of random mazes that means nothing."""
-    from ct_jax.presets import MAX_RANDOM_MAZES
+    from ct_jax.settings import MAX_RANDOM_MAZES
 
     if not 0 <= mazes <= MAX_RANDOM_MAZES:
         raise UserError(f"--random-mazes {mazes}: give a number from 0 to {MAX_RANDOM_MAZES}")
@@ -487,7 +487,7 @@ def _evaluate(command: Evaluate) -> None:
         from ct_jax.devices import is_first
 
         names = ("maze", "episodes", "horizon", "engine", "worlds", "pairs", "density", "noise")
-        names += ("optimism", "picture", "video")
+        names += ("return_scale", "picture", "video")
         given = {name: value for name in names if (value := getattr(command, name)) is not None}
 
         def keep(row: Row) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ct_envs import UserError
-from ct_envs.checked import Checked, Within
-from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, to_heading
+from ct_envs.turtlebot3 import RADIUS_M, to_heading
 from ct_envs.turtlebot3_pool import Episode, Frame, Turtlebot3Pool
-from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY, World, random_world
+from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
 from ct_jax.checkpoint import read_json, write_json
 from ct_jax.collect import CollectConfig, Guide, gather
 from ct_jax.controllers.differential_drive import DifferentialDrive
@@ -26,31 +25,11 @@ from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap
 from ct_jax.trajectories import Trajectories, load, save
 
-MAX_WORLDS = 1000
-MAX_FACTOR = MAX_DENSITY / max(TRAIN_DENSITY)  # obstacle density relative to training
 _PAIRS = 200  # number of starts and goals that are tried in one world
 _APART_M = 1.0  # smallest distance between start and goal
 _LOOK = 24  # number of waypoints checked first: usually one of the best is visible
 _NUDGE_M = 1e-3
 _CLEAR_M = 0.05  # distance that the explorer keeps to obstacles; includes half a cell of its grid
-
-
-@dataclass(frozen=True)
-class RoomConfig(Checked):
-    """The rooms of training and evaluation."""
-
-    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # density of obstacles in training; the published numbers
-    # are measured at 1
-    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # if given, each room's density is drawn between
-    # ``density`` and this
-    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of sensor and motion noise in training; 1 is that of a
-    # real robot
-    worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # number of evaluation rooms (paper)
-
-    @property
-    def densities(self) -> tuple[float, float]:
-        """The range from which the densities of the training rooms are drawn."""
-        return self.density, self.density if self.densest is None else self.densest
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,12 +269,12 @@ def _are_flags(found: Any, kinds: int, n: int) -> bool:
     return sizes == [kinds, *[n] * kinds] and all(isinstance(flag, bool) for each in found for flag in each)
 
 
-def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
+def keeping(folder: Path, *, kinds: int, hint: str) -> Callable[[Callable[[int], Any]], Callable[[int], Any]]:
     """Save each wave in a folder. After an interruption, read the saved waves back instead of driving them again.
 
     Args:
         kinds: number of flag arrays that a wave has besides its trajectories.
-        mend: the advice in the error about a damaged file.
+        hint: the advice in the error about a damaged file.
     """
     make_folder(folder, parents=True)
 
@@ -309,10 +288,10 @@ def keeping(folder: Path, *, kinds: int, mend: str) -> Callable[[Callable[[int],
             try:
                 data = load(file)
             except UserError as bad:
-                raise UserError(f"{bad}: {mend}") from None
-            found = read_json(flags_file, mend=mend).get("flags")
+                raise UserError(f"{bad}: {hint}") from None
+            found = read_json(flags_file, hint=hint).get("flags")
             if not _are_flags(found, kinds, data.n):
-                raise UserError(f"{flags_file}: not {kinds} flags of {data.n} episodes; {mend}")
+                raise UserError(f"{flags_file}: not {kinds} flags of {data.n} episodes; {hint}")
             return data, *np.array(found, bool)
 
         return read_or_drive

@@ -53,11 +53,11 @@ def start_backend() -> None:
     except Exception as bad:  # there are many kinds, an assertion without a word among them
         said = " ".join(f"{name}='{os.environ[name]}'" for name in _SAID if os.environ.get(name))
         reason = " ".join(str(bad).split())[:300] or "no such platform is installed"
-        mend = (
+        hint = (
             "set JAX_PLATFORMS=cpu and unset XLA_FLAGS, or install the platform's plug-in "
             "(NVIDIA: pip install 'jax[cuda13]')"
         )
-        raise UserError(f"JAX finds no device{' with ' * bool(said)}{said} ({reason}); {mend}") from None
+        raise UserError(f"JAX finds no device{' with ' * bool(said)}{said} ({reason}); {hint}") from None
 
 
 def start(coordinator: str | None, processes: int | None, process: int | None) -> None:
@@ -79,8 +79,8 @@ def start(coordinator: str | None, processes: int | None, process: int | None) -
         jax.distributed.initialize(coordinator, processes, process, coordinator_bind_address=listens)
     except (ValueError, RuntimeError) as bad:
         where = f"{coordinator}: process {process} of {processes} cannot join" if coordinator else "no cluster is found"
-        mend = "" if coordinator else "; name it with --coordinator HOST:PORT --processes N --process I"
-        raise UserError(f"{where} ({' '.join(str(bad).split())[:200]}){mend}") from None
+        hint = "" if coordinator else "; name it with --coordinator HOST:PORT --processes N --process I"
+        raise UserError(f"{where} ({' '.join(str(bad).split())[:200]}){hint}") from None
     interrupts.obey_together(largest)
 
 
@@ -97,8 +97,8 @@ def listening_address(coordinator: str) -> str:
             tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind(address)
     except OSError as bad:
-        mend = "give an address of process 0's own machine, and a port that is free there"
-        raise UserError(f"--coordinator {coordinator}: cannot listen there ({bad.strerror or bad}); {mend}") from None
+        hint = "give an address of process 0's own machine, and a port that is free there"
+        raise UserError(f"--coordinator {coordinator}: cannot listen there ({bad.strerror or bad}); {hint}") from None
     return f"[{address[0]}]:{port}" if family == socket.AF_INET6 else f"{address[0]}:{port}"
 
 

@@ -28,11 +28,11 @@ class Drive:
     position: Float[np.ndarray, "T 2"]  # before the action, in the world [m]
     yaw_rad: Float[np.ndarray, "T"]
     proprio: Float[np.ndarray, "T 2"]  # cos dpsi, sin dpsi
-    goal: Float[np.ndarray, "T 2"]  # observed vector to the final goal [m]
+    goal_relative: Float[np.ndarray, "T 2"]  # observed vector to the final goal [m]
     map_bits: UInt8[np.ndarray, "T 157"]
     action: Float[np.ndarray, "T 2"]  # as intended, without disturbance; in shares of the top speeds
-    target: Float[np.ndarray, "T 2"]  # to be imitated
-    learn: Float[np.ndarray, "T"]  # 1 if the target is to be imitated
+    label: Float[np.ndarray, "T 2"]  # to be imitated
+    label_mask: Float[np.ndarray, "T"]  # 1 if the target is to be imitated
     reward: Float[np.ndarray, "T"]  # after the action
     frontal: Bool[np.ndarray, "T"]
     grazing: Bool[np.ndarray, "T"]
@@ -61,11 +61,12 @@ def to_trajectories(drives: Sequence[Drive]) -> Trajectories:
     longest = max(each.length for each in drives)
     parts = []
     for each in drives:
-        steps = {name: getattr(each, name)[None] for name in ("position", "proprio", "action", "target", "reward")}
-        steps |= {"learn": each.learn[None], "collision": each.collision[None].astype(np.float32)}
+        steps = {name: getattr(each, name)[None] for name in ("position", "proprio", "action", "label", "reward")}
+        steps |= {"label_mask": each.label_mask[None], "collision": each.collision[None].astype(np.float32)}
         part = Trajectories(
-            **steps, goal=each.goal_world[None], maze=np.zeros(1, np.int32), length=np.array([each.length], np.int32),
-            seen=each.goal[None], map_bits=each.map_bits[None],
+            **steps, goal_world=each.goal_world[None], maze=np.zeros(1, np.int32),
+            length=np.array([each.length], np.int32), goal_relative=each.goal_relative[None],
+            map_bits=each.map_bits[None],
         )  # fmt: skip
         parts.append(pad(part, 1, longest))
     names = Trajectories.__dataclass_fields__
@@ -102,7 +103,7 @@ def drive(
     while not frame.done.all():
         action, memory = driver.act(memory, frame)
         action = Action(*(np.asarray(leaf) for leaf in action))
-        after = pool.step(action.done)
+        after = pool.step(action.executed)
         moments.append(_Moment(frame._replace(map=pack_maps(frame.map)), action, after._replace(map=_NOTHING)))
         frame = after
         raise_if_interrupted()
@@ -119,9 +120,9 @@ def _record(moments: list[_Moment], slot: int, episode: Episode) -> Drive:
 
     before, after = functools.partial(take, "before"), functools.partial(take, "after")
     return Drive(
-        position=before("position"), yaw_rad=before("yaw_rad"), proprio=before("proprio"), goal=before("goal"),
-        map_bits=before("map", np.uint8), action=take("action", "meant"), target=take("action", "target"),
-        learn=take("action", "learn"), reward=after("reward"), frontal=after("frontal", bool),
+        position=before("position"), yaw_rad=before("yaw_rad"), proprio=before("proprio"), goal_relative=before("goal"),
+        map_bits=before("map", np.uint8), action=take("action", "intended"), label=take("action", "label"),
+        label_mask=take("action", "label_mask"), reward=after("reward"), frontal=after("frontal", bool),
         grazing=after("grazing", bool), goal_world=np.asarray(episode.goal, np.float32),
         end_world=np.append(end.position[slot], end.yaw_rad[slot]).astype(np.float32), success=bool(end.success[slot]),
     )  # fmt: skip

@@ -48,7 +48,7 @@ class RecoverConfig(Checked):
 
 @struct.dataclass
 class Watching:
-    """Memory of ``Supervised``."""
+    """Memory of ``TakeoverPolicy``."""
 
     own: Any
     guided: Any
@@ -59,7 +59,7 @@ class Watching:
 
 
 @struct.dataclass
-class Supervised:
+class TakeoverPolicy:
     """The transformer until f(s) detects a failure; from then on the controller guided by the planner."""
 
     own: TransformerPolicy
@@ -81,9 +81,9 @@ class Supervised:
         rescued |= jax.random.bernoulli(chance_key, jnp.float32(self.config.takeover), rescued.shape)
         action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
         if self.config.keep == "relabelled":
-            action = action._replace(target=guided.target, learn=jnp.ones(rescued.shape, jnp.float32))
+            action = action._replace(label=guided.label, label_mask=jnp.ones(rescued.shape, jnp.float32))
         else:
-            action = action._replace(learn=rescued.astype(jnp.float32))
+            action = action._replace(label_mask=rescued.astype(jnp.float32))
         past = jnp.concatenate([memory.past[1:], position[None]])
         touched = jnp.concatenate([memory.touched[1:], state.info["collision"][None]])
         return action, Watching(own_memory, guided_memory, past, touched, memory.steps + 1, rescued)
@@ -125,7 +125,7 @@ def recover(
     maze_key, wave_key = jax.random.split(key)
     # Each round begins at another maze, if there are many.
     first_maze = int(jax.random.randint(maze_key, (), 0, len(mazes.cell_m), jnp.int32))
-    supervised = Supervised(policy, Guided(controller, guide, collecting.noise), config)
+    supervised = TakeoverPolicy(policy, Guided(controller, guide, collecting.noise), config)
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
         batch_key, run_key = jax.random.split(jax.random.fold_in(wave_key, first))
@@ -166,7 +166,7 @@ def gather_recoveries(
         if config.keep == "relabelled":  # also keep the transformer's own successes and falls: they are relabelled too
             data, rescued = lie_for_ever(data, broke, horizon), rescued | broke
         else:
-            rescued = rescued & (data.learn.sum(1) > 0)
+            rescued = rescued & (data.label_mask.sum(1) > 0)
         kept += _split(select(data, rescued)) if config.keep == "separate" else [select(data, rescued)]
         recoveries, episodes = recoveries + int(joined(rescued).sum()), episodes + envs
         broken += int(joined(broke).sum())
@@ -188,10 +188,10 @@ def lie_for_ever(data: Trajectories, broke: Bool[Array, "N"], horizon: int) -> T
 
 def _split(data: Trajectories) -> list[Trajectories]:
     """Split each trajectory in two: up to the failure, and the recovery from it."""
-    learn = np.asarray(data.learn)
-    begin = learn.argmax(1)
-    fail = data.replace(length=begin.astype(np.int32), learn=np.float32(np.arange(learn.shape[1]) < begin[:, None]))
-    later = np.minimum(np.arange(learn.shape[1]) + begin[:, None], learn.shape[1] - 1)
+    imitated = np.asarray(data.label_mask)
+    step, begin = np.arange(imitated.shape[1]), imitated.argmax(1)
+    fail = data.replace(length=begin.astype(np.int32), label_mask=np.float32(step < begin[:, None]))
+    later = np.minimum(step + begin[:, None], len(step) - 1)
     row = np.arange(data.n)[:, None]
     moved = {name: leaf[row, later] for name, leaf in arrays_of(data).items() if name in (*PER_STEP, *OBSERVED)}
     recovery = replace(data, **moved, length=np.asarray(data.length) - begin)

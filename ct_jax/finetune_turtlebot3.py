@@ -16,7 +16,7 @@ from ct_jax.collect_turtlebot3 import draw_wave, make_guide
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.drive import GuidedDriver, drive, to_trajectories
 from ct_jax.evaluate_turtlebot3 import as_state
-from ct_jax.finetune import RecoverConfig, Supervised, gather_recoveries
+from ct_jax.finetune import RecoverConfig, TakeoverPolicy, gather_recoveries
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
@@ -36,14 +36,14 @@ class Given:
 
 @dataclass(frozen=True)
 class SupervisedDriver:
-    """The transformer until it fails, then the planner: ``Supervised`` in the slots of a pool."""
+    """The transformer until it fails, then the planner: ``TakeoverPolicy`` in the slots of a pool."""
 
-    supervised: Supervised  # with ``Given`` for the planner
+    supervised: TakeoverPolicy  # with ``Given`` for the planner
     planner: GuidedDriver
     key: jax.Array
 
     def act(self, memory: tuple[Any, Any, int], frame: Frame) -> tuple[Action, tuple[Any, Any, int]]:
-        """The action of the transformer or the planner. Memory: that of ``Supervised``, the planner's, and the step."""
+        """The action of the transformer or the planner. Memory: the watching, the planner's, the step."""
         watching, led, step = memory
         guided, led = self.planner.act(led, frame)
         key = jax.random.fold_in(self.key, step)
@@ -76,7 +76,7 @@ def recover(
     guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, prm)
     planner = GuidedDriver(guide, controller, collecting.noise)
     draw_key, act_key = jax.random.split(key)
-    supervised = Supervised(policy, Given(), config)  # pyright: ignore[reportArgumentType]
+    supervised = TakeoverPolicy(policy, Given(), config)  # pyright: ignore[reportArgumentType]
 
     def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
         drawn = draw_wave(draw_key, first, collecting, prm, n=collecting.envs, densities=densities)

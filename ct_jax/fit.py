@@ -25,7 +25,7 @@ from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
-from ct_jax.transformer import RETURN_SCALE, ControlTransformer, Modes, sample_inputs
+from ct_jax.transformer import RETURN_DIVISOR, ControlTransformer, Modes, sample_inputs
 from ct_jax.value import ValueNetwork
 
 # Expected squared error within one mode. It is larger than the error of a single-mode model (point 0.03, ant 0.014):
@@ -152,24 +152,24 @@ def transformer_loss(model: ControlTransformer) -> Loss:
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
         predicted: Modes = model.apply(
-            params, window.map, window.proprio, window.goal, window.action, window.rtg, window.timestep, window.valid,
-            deterministic=False, rngs={"dropout": key}, method="propose",
+            params, window.map, window.proprio, window.goal_relative, window.action, window.rtg, window.timestep,
+            window.valid, deterministic=False, rngs={"dropout": key}, method="propose",
         )  # fmt: skip # pyright: ignore
-        error = jnp.mean((predicted.action - window.target[..., None, :]) ** 2, -1)
+        error = jnp.mean((predicted.action - window.label[..., None, :]) ** 2, -1)
         likelihood = jax.nn.log_softmax(predicted.logit) - error / MODE_SPREAD
         error = -MODE_SPREAD * jax.nn.logsumexp(likelihood, -1)
-        return jnp.sum(error * window.learn) / jnp.maximum(jnp.sum(window.learn), 1.0)
+        return jnp.sum(error * window.label_mask) / jnp.maximum(jnp.sum(window.label_mask), 1.0)
 
     return loss
 
 
 def value_loss(model: ValueNetwork) -> Loss:
-    """Mean squared error of the predicted return-to-go, in units of ``RETURN_SCALE`` (paper, sec. III-D)."""
+    """Mean squared error of the predicted return-to-go, in units of ``RETURN_DIVISOR`` (paper, sec. III-D)."""
 
     def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
         del key
-        value = model.apply(params, window.map, window.proprio, window.goal)
-        error = ((value - window.rtg) / RETURN_SCALE) ** 2  # pyright: ignore
+        value = model.apply(params, window.map, window.proprio, window.goal_relative)
+        error = ((value - window.rtg) / RETURN_DIVISOR) ** 2  # pyright: ignore
         return jnp.sum(error * window.valid) / jnp.maximum(jnp.sum(window.valid), 1.0)
 
     return loss
@@ -203,7 +203,7 @@ def best_trajectories(data: Trajectories, config: ValueConfig, goal_tolerance_m:
         if not joined(keep).any():
             raise UserError("every trajectory has a collision; raise prm.margin_m or set value.collision_free=False")
     if config.top < 1.0:
-        straight = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=1)
+        straight = np.linalg.norm(np.asarray(data.goal_world) - np.asarray(data.position)[:, 0], axis=1)
         score = np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
         keep &= score >= np.quantile(joined(score[keep]), 1.0 - config.top)
     return select(data, keep)

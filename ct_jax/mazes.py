@@ -20,10 +20,10 @@ from ct_jax.files import check_writable, save_arrays
 from ct_jax.finetune import recover
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.policy import TransformerPolicy
-from ct_jax.presets import MAX_EPISODES
 from ct_jax.prm import PrmConfig, Roadmap, build_roadmap
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, join_mazes, kept_row, slug, training
+from ct_jax.settings import MAX_EPISODES
 from ct_jax.trajectories import Trajectories
 
 PICTURES = (".png", ".svg", ".pdf")
@@ -41,13 +41,13 @@ class MazeCourse:
     def controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
         """The run's own controller, learned or taken over once from where it was given, and its configuration."""
         controller, config = self._controller(metrics)
-        effort = self.run.settings.controller_effort * config.effort
-        return controller.replace(effort=effort), replace(config, effort=effort)
+        action_scale = self.run.settings.controller_action_scale * config.action_scale
+        return controller.replace(action_scale=action_scale), replace(config, action_scale=action_scale)
 
     def _controller(self, metrics: Metrics) -> tuple[SacController, SacConfig]:
         run, config = self.run, self.run.settings.sac
         if run.done("controller") is not None:
-            return load_controller(str(run.folder), run.robot, mend=run.mend("controller"))
+            return load_controller(str(run.folder), run.robot, hint=run.hint("controller"))
         if run.settings.controller != "own":  # a copy: whatever comes to lie there, the run goes on with what it had
             with run.stage("controller") as (folder, info):
                 devices.first(lambda: copy_controller(run.settings.controller, run.robot, folder))

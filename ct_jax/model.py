@@ -22,13 +22,14 @@ from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.files import make_folder, whole
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
-from ct_jax.presets import Settings, from_dict, sac_from_dict, to_dict
+from ct_jax.settings import Settings, from_dict, sac_from_dict, to_dict
 from ct_jax.transformer import ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
 ZOO = "zoo:"
-FORMATS = (1, 2)  # of model.json and controller.json
+FORMAT = 3  # of model.json and controller.json; this version reads 1 to it
 BOUND = 2  # from this format on, weights are bound to what the file beside them says of them
+NAMED = 3  # from this format on, the settings of a controller have the names of today
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def save_model(folder: Path, model: TrainedModel) -> None:
     (folder / "model.json").unlink(missing_ok=True)  # written last: it says that the weights are whole
     said = {"robot": model.robot, "settings": to_dict(model.settings)}
     save_weights(folder / "weights.safetensors", _arrays(model.policy, model.controller), of=said)
-    write_json(folder / "model.json", {"format": BOUND} | said | {"made": model.made})
+    write_json(folder / "model.json", {"format": FORMAT} | said | {"made": model.made})
 
 
 def zoo_names() -> list[str]:
@@ -89,38 +90,37 @@ def load_model(run: str) -> TrainedModel:
     """
     folder = model_folder(run)
     file = folder / "model.json"
-    mend = f"delete {folder} and continue the run with --resume" if folder.name == "model" else "fetch it anew"
-    found, bound = _read_description(file, mend)
+    hint = f"delete {folder} and continue the run with --resume" if folder.name == "model" else "fetch it anew"
+    found, number = _read_description(file, hint)
     said = {name: found.get(name) for name in ("robot", "settings")}
     try:
         robot, settings = get_robot(said["robot"]).name, from_dict(said["settings"])
         _check_robot(robot, settings)
     except UserError as bad:
-        raise UserError(f"{file}: not a model's description ({bad}); {mend}") from None
+        raise UserError(f"{file}: not a model's description ({bad}); {hint}") from None
     weights = folder / "weights.safetensors"
-    arrays = read_weights(weights, of=said, bound=bound, mend=mend)
+    arrays = read_weights(weights, of=said, bound=number >= BOUND, hint=hint)
     policy, controller = blank_model(robot, settings)
-    arrays = jax.tree.map(jnp.asarray, arrange_weights(weights, arrays, _arrays(policy, controller), mend=mend))
+    arrays = jax.tree.map(jnp.asarray, arrange_weights(weights, arrays, _arrays(policy, controller), hint=hint))
     policy = replace(policy, params=arrays["transformer"], value_params=arrays["value"])
     if isinstance(controller, SacController):
         controller = replace(controller, normalizer=arrays["normalizer"], policy=arrays["controller"])
     return TrainedModel(robot, settings, policy, controller, found["made"])
 
 
-def _read_description(file: Path, mend: str) -> tuple[dict[str, Any], bool]:
-    """What ``model.json`` or ``controller.json`` says, and whether the weights must be bound to it.
+def _read_description(file: Path, hint: str) -> tuple[dict[str, Any], int]:
+    """What ``model.json`` or ``controller.json`` says, and its format.
 
     Raises:
         UserError: no JSON, or of a format that this version does not know.
     """
-    found = {"made": {}} | read_json(file, mend=mend)
+    found = {"made": {}} | read_json(file, hint=hint)
     number = found.get("format")
-    if type(number) is not int or number not in FORMATS:
-        known = " and ".join(map(str, FORMATS))
-        raise UserError(f"{file}: of format {shown(number)}; this version of ct-jax reads {known}; {mend}")
+    if type(number) is not int or not 1 <= number <= FORMAT:
+        raise UserError(f"{file}: of format {shown(number)}; this version of ct-jax reads 1 to {FORMAT}; {hint}")
     if not isinstance(found["made"], dict):
-        raise UserError(f"{file}: 'made' is {shown(found['made'])}, not an object; {mend}")
-    return found, number >= BOUND
+        raise UserError(f"{file}: 'made' is {shown(found['made'])}, not an object; {hint}")
+    return found, number
 
 
 def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
@@ -128,23 +128,23 @@ def save_controller(folder: Path, robot: str, config: SacConfig, controller: Sac
     make_folder(folder, parents=True)
     said = {"robot": robot, "sac": asdict(config)}
     save_weights(folder / "weights.safetensors", controller, of=said)
-    write_json(folder / "controller.json", _sizes(robot) | said | {"format": BOUND, "made": made})
+    write_json(folder / "controller.json", _sizes(robot) | said | {"format": FORMAT, "made": made})
 
 
 def load_controller(
-    where: str, robot: str, *, mend: str = "give another, or learn your 'own'"
+    where: str, robot: str, *, hint: str = "give another, or learn your 'own'"
 ) -> tuple[SacController, SacConfig]:
     """Read the controller of a robot from a run folder, a controller's folder, or with "zoo" the shipped one.
 
     Args:
-        mend: what the error tells a person to do about a damaged file.
+        hint: what the error tells a person to do about a damaged file.
 
     Raises:
         UserError: there is none, it is damaged, or it is another robot's (both are described).
     """
     folder = _controller_folder(where, robot)
     file = folder / "controller.json"
-    found, bound = _read_description(file, mend)
+    found, number = _read_description(file, hint)
     needed = _sizes(robot)
     sizes = {name: found.get(name) for name in needed}
     if sizes != needed:
@@ -152,16 +152,16 @@ def load_controller(
             ", ".join(f"{name} {shown(value, quoted=False)}" for name, value in each.items())
             for each in (sizes, needed)
         ]
-        raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {mend}")
+        raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {hint}")
     said = {name: found.get(name) for name in ("robot", "sac")}
     try:
-        config = sac_from_dict(said["sac"])
+        config = sac_from_dict(said["sac"], old=number < NAMED)
         _check_robot(robot, Settings(sac=config))
     except UserError as bad:
-        raise UserError(f"{file}: not a controller's description ({bad}); {mend}") from None
+        raise UserError(f"{file}: not a controller's description ({bad}); {hint}") from None
     weights = folder / "weights.safetensors"
-    arrays = read_weights(weights, of=said, bound=bound, mend=mend)
-    controller = arrange_weights(weights, arrays, _blank_sac(robot, config), mend=mend)
+    arrays = read_weights(weights, of=said, bound=number >= BOUND, hint=hint)
+    controller = arrange_weights(weights, arrays, _blank_sac(robot, config), hint=hint)
     return jax.tree.map(jnp.asarray, controller), config
 
 
@@ -219,8 +219,8 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
             config=settings.model,
             action_size=action_size,
             value_width=settings.value.width,
-            optimism=settings.optimism,
-            reprompt=settings.reprompt,
+            return_scale=settings.return_scale,
+            clip_target_return=settings.clip_target_return,
             sac=sac,
         )
 

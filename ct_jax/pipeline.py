@@ -27,10 +27,10 @@ from ct_jax.mazes import MazeCourse, evaluate_in_maze
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
-from ct_jax.presets import MAX_OPTIMISM, MAX_SEED
 from ct_jax.progress import Bar, Metrics
 from ct_jax.rooms import RoomCourse, evaluate_in_rooms
 from ct_jax.run import Run, drop_leftovers, is_row, open_run, training
+from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer, with_skill
 from ct_jax.value import ValueNetwork
@@ -125,11 +125,11 @@ def _read_trajectories(run: Run, file: Path) -> Trajectories:
     try:
         data = storage.load(file)
     except UserError as bad:
-        raise UserError(f"{bad}: {run.mend(file.parent.name)}") from None
+        raise UserError(f"{bad}: {run.hint(file.parent.name)}") from None
     mazes = len(run.mazes) + max(run.settings.random_mazes, run.settings.recover.random_mazes)
     fits = (data.proprio.shape[-1], data.action.shape[-1]) == sizes(run.robot)
     if not fits or (data.map_bits is None) != bool(run.mazes) or np.max(data.maze, initial=0) >= max(mazes, 1):
-        raise UserError(f"{file}: trajectories of another run; {run.mend(file.parent.name)}")
+        raise UserError(f"{file}: trajectories of another run; {run.hint(file.parent.name)}")
     return data
 
 
@@ -196,7 +196,7 @@ def _fit_network(
     folder = run.folder / stage
     file = folder / f"{name}.safetensors"
     if devices.first(file.is_file):
-        return jax.tree.map(jnp.asarray, load_weights(file, params, mend=run.mend(stage)))
+        return jax.tree.map(jnp.asarray, load_weights(file, params, hint=run.hint(stage)))
     with training(folder, name, learner.config.updates, metrics) as watch:
         params = fit(key, learner, params, data, run.stacked, **watch)
     devices.first(lambda: save_weights(file, params))
@@ -247,23 +247,23 @@ def _evaluate(run: Run, course: Course, model: TrainedModel) -> None:
 def results(folder: Path) -> list[dict[str, Any]]:
     """The rows of a run's table. Raises UserError if they are damaged."""
     file = folder / "evaluate" / "results.json"
-    mend = f"delete {file.parent} and continue with --resume"
-    rows = read_json(file, mend=mend).get("rows")
+    hint = f"delete {file.parent} and continue with --resume"
+    rows = read_json(file, hint=hint).get("rows")
     if not isinstance(rows, list) or not all(map(is_row, rows)):
-        raise UserError(f"{file}: not the rows of a table; {mend}")
+        raise UserError(f"{file}: not the rows of a table; {hint}")
     return rows
 
 
 @with_own_numerics
 def evaluate_model(
-    run: str, *, method: str, seed: int, optimism: float | None = None,
+    run: str, *, method: str, seed: int, return_scale: float | None = None,
     keep: Callable[[dict[str, Any]], None] = lambda row: None, **options: Any
 ) -> dict[str, Any]:  # fmt: skip
     """Evaluate one method of a run folder or zoo model; returns its row of the table.
 
     Args:
         keep: told the row as soon as it is there, before anything is drawn.
-        optimism: k, in place of the model's own.
+        return_scale: k, in place of the model's own.
         options: of ``evaluate_in_maze`` or ``evaluate_in_rooms``, whichever the robot is for.
 
     Raises:
@@ -282,18 +282,18 @@ def evaluate_model(
         if name not in known:
             raise UserError(f"--{name} is not for the {model.robot}; its options: --{', --'.join(known)}")
     asked = {}
-    if optimism is not None:
-        model, asked = _asking(model, method, optimism), {"optimism": optimism}
+    if return_scale is not None:
+        model, asked = _asking(model, method, return_scale), {"return_scale": return_scale}
     return evaluation(model, method, seed, lambda row: keep(row | asked), **options) | asked
 
 
-def _asking(model: TrainedModel, method: str, optimism: float) -> TrainedModel:
+def _asking(model: TrainedModel, method: str, return_scale: float) -> TrainedModel:
     """The model asking for k times the predicted return. Raises UserError for a k that means nothing."""
-    if not 0.0 < optimism <= MAX_OPTIMISM:
-        raise UserError(f"--optimism {optimism}: give a factor above 0, at most {MAX_OPTIMISM:g}")
+    if not 0.0 < return_scale <= MAX_RETURN_SCALE:
+        raise UserError(f"--return_scale {return_scale}: give a factor above 0, at most {MAX_RETURN_SCALE:g}")
     if method != "ct" or not model.settings.model.returns:
-        raise UserError("--optimism is for a transformer that asks for a return (--method ct); leave it out")
-    return replace(model, policy=model.policy.replace(optimism=optimism))
+        raise UserError("--return_scale is for a transformer that asks for a return (--method ct); leave it out")
+    return replace(model, policy=model.policy.replace(return_scale=return_scale))
 
 
 def _check_processes(robot: Robot) -> None:

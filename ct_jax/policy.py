@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ct_jax.controllers.sac import SacConfig
-from ct_jax.rollout import Action, act_as_meant
+from ct_jax.rollout import Action, act_as_intended
 from ct_jax.transformer import Cache, ControlTransformer, History, ModelConfig, empty_cache, empty_history
 from ct_jax.value import ValueNetwork
 
@@ -31,8 +31,10 @@ class TransformerPolicy:
     config: ModelConfig = struct.field(pytree_node=False)
     action_size: int = struct.field(pytree_node=False)
     value_width: int = struct.field(pytree_node=False, default=128)
-    optimism: float = struct.field(pytree_node=False, default=1.0)  # k: ask for k * V (paper)
-    reprompt: bool = struct.field(pytree_node=False, default=False)  # never ask for more than V of the present state
+    return_scale: float = struct.field(pytree_node=False, default=1.0)  # k: ask for k * V (paper)
+    clip_target_return: bool = struct.field(
+        pytree_node=False, default=False
+    )  # never ask for more than V of the present state
     sac: SacConfig | None = struct.field(pytree_node=False, default=None)  # of the controller that is its head
 
     @property
@@ -53,17 +55,17 @@ class TransformerPolicy:
     def _value(policy: "TransformerPolicy", state: State) -> Float[Array, "N"]:
         obs: dict = state.obs  # pyright: ignore
         value = ValueNetwork(policy.value_width).apply(policy.value_params, obs["map"], obs["proprio"], obs["goal"])
-        return policy.optimism * value  # pyright: ignore
+        return policy.return_scale * value  # pyright: ignore
 
     def act(self, memory: Conditioned, state: State, key: jax.Array) -> tuple[Action, Conditioned]:
         """The next actions; the reward just received is taken off the return-to-go."""
         del key
         obs: dict = state.obs  # pyright: ignore
         rtg = memory.rtg - state.reward
-        if self.reprompt:
+        if self.clip_target_return:
             rtg = jnp.minimum(rtg, self._value(self, state))
         method = "act_on_window" if self.config.acting == "window" else "act"
         action, past = self.model.apply(
             self.params, memory.past, obs["map"], obs["proprio"], obs["goal"], rtg, method=method
         )  # pyright: ignore
-        return act_as_meant(action), Conditioned(past, rtg)
+        return act_as_intended(action), Conditioned(past, rtg)

@@ -1,54 +1,18 @@
-"""All settings of a run, and the presets: instances of them."""
+"""The presets: settings for each robot."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any
+from dataclasses import replace
 
 from ct_envs import UserError
-from ct_envs.checked import Above, Checked, Within, from_json
 from ct_envs.lidar import LIDAR_CELL_M
 from ct_envs.robots import get_robot
 from ct_jax.collect import CollectConfig
-from ct_jax.collect_turtlebot3 import RoomConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import RecoverConfig
 from ct_jax.fit import FitConfig, ValueConfig
 from ct_jax.prm import PrmConfig
+from ct_jax.settings import RoomConfig, Settings, with_fits
 from ct_jax.transformer import ModelConfig
-
-MAX_SEED = 2**32 - 1
-MAX_OPTIMISM = 10.0
-MAX_EPISODES, MAX_RANDOM_MAZES = 100_000, 10_000
-
-
-@dataclass(frozen=True)
-class Settings(Checked):
-    """Everything a run depends on besides its robot, mazes, engine and seed."""
-
-    prm: PrmConfig = PrmConfig()
-    controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
-    sac: SacConfig = SacConfig()
-    controller_effort: Annotated[float, Above(0, 1)] = 1.0  # of a learned controller's actions, when it leads: with
-    # less it falls less
-    collect: CollectConfig = CollectConfig()
-    model: ModelConfig = ModelConfig()
-    value: ValueConfig = ValueConfig()
-    fit: FitConfig = FitConfig()
-    recover: RecoverConfig = RecoverConfig()
-    rounds: Annotated[int, Within(0, 1000)] = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
-    round_fit: FitConfig | None = None  # the training in each round but the last; by default as ``fit``
-    last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
-    optimism: Annotated[float, Above(0, MAX_OPTIMISM)] = 1.0  # k: ask for k * V (paper, sec. III-D)
-    reprompt: bool = False  # never ask for more than V of the present state
-    random_mazes: Annotated[int, Within(0, MAX_RANDOM_MAZES)] = (
-        0  # so many mazes of a generator to collect and recover in,
-    )
-    # besides the named ones
-    episodes: Annotated[int, Within(1, MAX_EPISODES)] = 100  # start-goal pairs of the evaluation in each maze (paper)
-    pairs_seed: Annotated[int, Within(0, MAX_SEED)] = 0  # their seed: not the run's, so that all models meet the same
-    # pairs
-    rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
-
 
 PAPER = Settings(
     model=ModelConfig(layers=4, heads=4, width=512, context=50, context_acting=200, acting="window"),
@@ -77,8 +41,8 @@ CPU = replace(
     value=ValueConfig(fit=replace(PUBLISHED.value.fit, mirror=True)),
     recover=RecoverConfig(recoveries=250, keep="relabelled", takeover=0.01, patience=250),
     rounds=10,
-    optimism=0.75,
-    reprompt=True,
+    return_scale=0.75,
+    clip_target_return=True,
     round_fit=replace(_LIFTED, updates=300, warmup=20),
     last_fit=replace(_LIFTED, updates=2500, warmup=20, decay=True),
 )
@@ -111,7 +75,7 @@ _ANT_SAC = SacConfig(
     critic_norm=True,
     arrival_bonus=100.0,
     tilt_m=3.0,
-    effort=0.4,
+    action_scale=0.4,
     greedy=0.25,
     reward_scale=0.1,
     replay=1_000_000,
@@ -176,7 +140,7 @@ def _for_humanoid(settings: Settings) -> Settings:
     )
     model = replace(settings.model, max_timestep=2048)
     settings = replace(settings, recover=recover, model=model)
-    if not settings.reprompt:
+    if not settings.clip_target_return:
         return settings
     # The controller's actions change fast with the body's attitude: a head that learned them from examples fell.
     # Mirrored, they are off by half of their variance.
@@ -188,16 +152,10 @@ def _for_walker(settings: Settings, sac: SacConfig, *, horizon: int, calm: float
     method, a head that knows the heading and a longer memory."""
     collect = replace(settings.collect, horizon=horizon, noise=calm * settings.collect.noise)
     settings = replace(settings, sac=sac, collect=collect, rounds=min(settings.rounds, 6))
-    if not settings.reprompt:
+    if not settings.clip_target_return:
         return settings
     model = replace(settings.model, frame="heading", context=64, context_acting=64)
     return with_fits(replace(settings, model=model), steps=96)
-
-
-def with_fits(settings: Settings, **changes: Any) -> Settings:
-    """The settings with changes to all trainings of the transformer."""
-    fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
-    return replace(settings, **{name: replace(fit, **changes) for name, fit in fits.items() if fit is not None})
 
 
 TURTLEBOT3_PAPER = Settings(
@@ -231,7 +189,7 @@ TURTLEBOT3_CPU = replace(
     rounds=6,
     round_fit=replace(_TURTLEBOT3_LIFTED, updates=500),
     last_fit=replace(_TURTLEBOT3_LIFTED, updates=4000),
-    reprompt=True,
+    clip_target_return=True,
 )
 """What lifts it: a teacher that knows no more than its pupil, and passes obstacles with room to spare; five seconds of
 memory instead of one, in which it does not see, and so does not repeat, what it did itself; free starts, disturbances,
@@ -278,42 +236,3 @@ def get_preset(name: str, robot: str = "point") -> Settings:
     if name not in presets:
         raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(presets))}")
     return presets[name]
-
-
-# Settings that came later, with what was before them: left out where they say just that, so that a run of then goes on.
-_LATER = {
-    "most_samples": 25_600,
-    "acting": "cache",
-    "rooms": None,
-    "random_mazes": 0,
-    "controller_effort": 1.0,
-    "modes": 1,
-    "commitment": 0.0,
-    "skill": False,
-    "stride": 1,
-    "turns": False,
-    "precision": "float32",
-}
-
-
-def to_dict(settings: Settings) -> dict[str, Any]:
-    """The settings as JSON holds them."""
-    return _without_later(asdict(settings))
-
-
-def _without_later(values: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: _without_later(value) if isinstance(value, dict) else value
-        for name, value in values.items()
-        if name not in _LATER or value != _LATER[name]
-    }
-
-
-def from_dict(values: Any) -> Settings:
-    """The settings that ``to_dict`` gave. Raises UserError if they are of another version, or out of their ranges."""
-    return from_json(Settings, values, "settings")
-
-
-def sac_from_dict(values: Any) -> SacConfig:
-    """The controller's part of ``from_dict``."""
-    return from_json(SacConfig, values, "sac")

@@ -18,13 +18,13 @@ from ct_jax.devices import sharded
 class Action(NamedTuple):
     """The action that a policy intended, the action executed (with a disturbance), and the action to imitate."""
 
-    meant: Float[Array, "N A"]
-    done: Float[Array, "N A"]
-    target: Float[Array, "N A"]
-    learn: Float[Array, "N"]  # 1 if the target is to be imitated, else 0
+    intended: Float[Array, "N A"]
+    executed: Float[Array, "N A"]
+    label: Float[Array, "N A"]
+    label_mask: Float[Array, "N"]  # 1 if the target is to be imitated, else 0
 
 
-def act_as_meant(action: Float[Array, "N A"]) -> Action:
+def act_as_intended(action: Float[Array, "N A"]) -> Action:
     """An action that is executed without disturbance and imitated as it is."""
     return Action(action, action, action, jnp.ones(action.shape[:1], jnp.float32))
 
@@ -44,9 +44,9 @@ class Steps:
     position: Float[Array, "T N 2"]
     proprio: Float[Array, "T N P"]
     action: Float[Array, "T N A"]  # as intended, without disturbance; 0 where that is not finite
-    target: Float[Array, "T N A"]  # to be imitated; 0 where it is not finite
+    label: Float[Array, "T N A"]  # to be imitated; 0 where it is not finite
     reward: Float[Array, "T N"]
-    learn: Float[Array, "T N"]  # 1 where the target is to be imitated and finite
+    label_mask: Float[Array, "T N"]  # 1 where the target is to be imitated and finite
     alive: Float[Array, "T N"]  # 1 where the episode was still running before the action
     success: Float[Array, "T N"]
     collision: Float[Array, "T N"]
@@ -78,16 +78,16 @@ def rollout(
     def once(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Steps]:
         state, memory = carry
         action, memory = policy.act(memory, state, key)
-        after = step(state, action.done)
+        after = step(state, action.executed)
         # One number that is not finite, in a past action or in a target, would make all that is learned so.
-        usable = jnp.all(jnp.isfinite(action.target), -1)
+        usable = jnp.all(jnp.isfinite(action.label), -1)
         record = Steps(
             position=state.info["position"],
             proprio=state.obs["proprio"],  # pyright: ignore[reportArgumentType]
-            action=jnp.where(jnp.isfinite(action.meant), action.meant, 0.0),
-            target=jnp.where(usable[:, None], action.target, 0.0),
+            action=jnp.where(jnp.isfinite(action.intended), action.intended, 0.0),
+            label=jnp.where(usable[:, None], action.label, 0.0),
             reward=after.reward,
-            learn=jnp.where(usable, action.learn, 0.0),
+            label_mask=jnp.where(usable, action.label_mask, 0.0),
             alive=1.0 - state.done,
             success=after.info["success"],
             collision=after.info["collision"],
@@ -143,9 +143,9 @@ class Guided:
         guide_memory, disturbance = memory
         action, guide_memory = self.intend(guide_memory, state)
         if not self.noise:
-            return act_as_meant(action), (guide_memory, disturbance)
+            return act_as_intended(action), (guide_memory, disturbance)
         keep_key, new_key = jax.random.split(key)
         keep = jax.random.bernoulli(keep_key, jnp.float32(self.hold), disturbance.shape[:1])[:, None]
         drawn = self.noise * jax.random.normal(new_key, disturbance.shape, jnp.float32)
         disturbance = jnp.where(keep, disturbance, drawn)
-        return act_as_meant(action)._replace(done=action + disturbance), (guide_memory, disturbance)
+        return act_as_intended(action)._replace(executed=action + disturbance), (guide_memory, disturbance)

@@ -18,7 +18,7 @@ from ct_envs.turtlebot3 import MAX_NOISE, Turtlebot3Config
 from ct_envs.turtlebot3_pool import Turtlebot3Pool
 from ct_envs.turtlebot3_world import World, load_world
 from ct_jax.checkpoint import write_json
-from ct_jax.collect_turtlebot3 import MAX_FACTOR, MAX_WORLDS, RoomConfig, collect, keeping
+from ct_jax.collect_turtlebot3 import collect, keeping
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import METHODS, Episodes, Pairs, check_horizon, horizon_for
@@ -28,6 +28,7 @@ from ct_jax.model import TrainedModel
 from ct_jax.policy import TransformerPolicy
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, cores, kept_row
+from ct_jax.settings import MAX_FACTOR, MAX_WORLDS, RoomConfig
 from ct_jax.trajectories import Trajectories
 
 NAME = "rooms"  # of all rooms of an evaluation together, where a maze's name stands
@@ -65,7 +66,7 @@ class RoomCourse:
         with self._pool(settings.collect.horizon) as pool:
             return collect(
                 key, pool, settings.collect, settings.prm, densities=self.config.densities, controller=controller,
-                on_progress=on_progress, keep=keeping(folder, kinds=1, mend=self.run.mend("collect")),
+                on_progress=on_progress, keep=keeping(folder, kinds=1, hint=self.run.hint("collect")),
             )  # fmt: skip
 
     def recover(
@@ -78,7 +79,7 @@ class RoomCourse:
             return recover(
                 key, pool, policy, settings.recover, settings.collect, settings.prm, densities=self.config.densities,
                 controller=controller, on_progress=on_progress,
-                keep=keeping(folder, kinds=2, mend=self.run.mend("finetune")),
+                keep=keeping(folder, kinds=2, hint=self.run.hint("finetune")),
             )  # fmt: skip
 
     def rows(self, folder: Path, model: TrainedModel) -> Iterator[dict[str, Any]]:

@@ -31,8 +31,8 @@ from ct_jax import __version__, devices
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.evaluate import Episodes
 from ct_jax.files import append_to, check_folders, drop_parts, make_folder, save_arrays
-from ct_jax.presets import Settings, to_dict
 from ct_jax.progress import Bar, Metrics
+from ct_jax.settings import Settings, from_dict, to_dict
 
 _ROW = {"method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "collision_rate", "steps_mean"}
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
@@ -81,7 +81,7 @@ class Run:
     def done(self, stage: str) -> dict[str, Any] | None:
         """What the finished stage said of itself; None if it has not finished."""
         file = self.folder / stage / "done.json"
-        return devices.first(lambda: read_json(file, mend=self.mend(stage)) if file.is_file() else None)
+        return devices.first(lambda: read_json(file, hint=self.hint(stage)) if file.is_file() else None)
 
     @property
     def made(self) -> dict[str, Any]:
@@ -93,7 +93,7 @@ class Run:
             raise UserError(f"{file}: '{missing[0]}' is missing; restore the file")
         return {name: config[name] for name in names}
 
-    def mend(self, stage: str) -> str:
+    def hint(self, stage: str) -> str:
         """What to do about a damaged file of a stage."""
         return f"delete {self.folder / stage} and continue with --resume"
 
@@ -333,11 +333,20 @@ def identity(run: Run) -> dict[str, Any]:
 
 
 def _check_same(run: Run, config: Path) -> None:
-    before = read_json(config, mend="restore it, or choose another folder with --out")
+    before = read_json(config, hint="restore it, or choose another folder with --out")
+    before |= {"settings": _settings_of(config, before.get("settings"))}
     for name, now in identity(run).items():
         found = _difference(name, before.get(name), now)
         if found:
             raise UserError(f"{config}: a run with {found}; choose another folder with --out")
+
+
+def _settings_of(config: Path, values: Any) -> dict[str, Any]:
+    """The settings that an earlier version may have written, as this one writes them."""
+    try:
+        return json.loads(json.dumps(to_dict(from_dict(values))))
+    except UserError as bad:
+        raise UserError(f"{config}: {bad}; choose another folder with --out") from None
 
 
 def _difference(name: str, before: Any, now: Any) -> str:

@@ -25,17 +25,22 @@ _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
 _MAP_BITS = 2 * MAP_CELLS**2
 
-PER_STEP = ("position", "proprio", "action", "target", "reward", "learn", "collision")
-OBSERVED = ("seen", "map_bits")  # also per step; only in trajectories that keep their maps
+PER_STEP = ("position", "proprio", "action", "label", "reward", "label_mask", "collision")
+OBSERVED = ("goal_relative", "map_bits")  # also per step; only in trajectories that keep their maps
 
 # Axes and kinds of the arrays of ``Trajectories``.
 _ARRAYS: dict[str, tuple[tuple[str | int, ...], type[np.generic]]] = {
     "position": (("N", "T", 2), np.floating), "proprio": (("N", "T", "P"), np.floating),
-    "action": (("N", "T", "A"), np.floating), "target": (("N", "T", "A"), np.floating),
-    "reward": (("N", "T"), np.floating), "learn": (("N", "T"), np.floating), "collision": (("N", "T"), np.floating),
-    "goal": (("N", 2), np.floating), "maze": (("N",), np.integer), "length": (("N",), np.integer),
-    "seen": (("N", "T", 2), np.floating), "map_bits": (("N", "T", -(-_MAP_BITS // 8)), np.uint8),
+    "action": (("N", "T", "A"), np.floating), "label": (("N", "T", "A"), np.floating),
+    "reward": (("N", "T"), np.floating), "label_mask": (("N", "T"), np.floating),
+    "collision": (("N", "T"), np.floating),
+    "goal_world": (("N", 2), np.floating), "maze": (("N",), np.integer), "length": (("N",), np.integer),
+    "goal_relative": (("N", "T", 2), np.floating), "map_bits": (("N", "T", -(-_MAP_BITS // 8)), np.uint8),
 }  # fmt: skip
+
+
+# Names of arrays in files of earlier versions.
+_NAMES_1 = {"target": "label", "learn": "label_mask", "goal": "goal_world", "seen": "goal_relative"}
 
 
 @struct.dataclass
@@ -45,15 +50,15 @@ class Trajectories:
     position: Float[Array, "N T 2"]  # before the action [m]
     proprio: Float[Array, "N T P"]
     action: Float[Array, "N T A"]  # as intended, without disturbance; input of later steps
-    target: Float[Array, "N T A"]  # to be imitated: the action itself, or the planner's (DAgger)
+    label: Float[Array, "N T A"]  # to be imitated: the action itself, or the planner's (DAgger)
     reward: Float[Array, "N T"]  # after the action
-    learn: Float[Array, "N T"]  # 1 if the target is to be imitated
+    label_mask: Float[Array, "N T"]  # 1 if the target is to be imitated
     collision: Float[Array, "N T"]
-    goal: Float[Array, "N 2"]  # final goal [m]
+    goal_world: Float[Array, "N 2"]  # final goal [m]
     maze: Int[Array, "N"]  # index into the mazes
     length: Int[Array, "N"]
     # Observations that cannot be recomputed from a maze; both are given or neither.
-    seen: Float[Array, "N T 2"] | None = None  # observed vector to the final goal [m]
+    goal_relative: Float[Array, "N T 2"] | None = None  # observed vector to the final goal [m]
     map_bits: UInt8[Array, "N T 157"] | None = None  # see ``pack_maps``
 
     @property
@@ -160,6 +165,7 @@ def _load(file: Path) -> Trajectories:
             found = {name: data[name] for name in data.files}
     except Exception as bad:  # a torn archive fails in a dozen ways
         raise UserError(f"{file}: not a trajectory file ({type(bad).__name__}); collect again") from None
+    found = {_NAMES_1.get(name, name): array for name, array in found.items()}
     wrong = _wrong(found)
     if wrong:
         raise UserError(f"{file}: not a trajectory file ({wrong}); collect again")
@@ -205,13 +211,13 @@ class Window:
 
     map: UInt8[Array, "B S 2 k k"]
     proprio: Float[Array, "B S P"]
-    goal: Float[Array, "B S 2"]  # from the robot to the final goal [m]
+    goal_relative: Float[Array, "B S 2"]  # from the robot to the final goal [m]
     action: Float[Array, "B S A"]
-    target: Float[Array, "B S A"]
+    label: Float[Array, "B S A"]
     rtg: Float[Array, "B S"]
     timestep: Int[Array, "B S"]
     valid: Float[Array, "B S"]  # 1 if the step exists, 0 for padding
-    learn: Float[Array, "B S"]  # 1 if the target is to be imitated
+    label_mask: Float[Array, "B S"]  # 1 if the target is to be imitated
     reward: Float[Array, "B S"]  # after the action
 
 
@@ -257,19 +263,19 @@ def sample_windows(
     at = jnp.minimum(at, trajectories.position.shape[1] - 1)
     take = lambda leaf: leaf[which[:, None], at]  # noqa: E731
     if trajectories.map_bits is not None:
-        maps, goal = unpack_maps(take(trajectories.map_bits)), take(trajectories.seen)
+        maps, goal = unpack_maps(take(trajectories.map_bits)), take(trajectories.goal_relative)
     else:
         maps, goal = _see(trajectories, mazes, which, take(trajectories.position), map_cell_m)
     window = Window(
         map=maps,
         proprio=take(trajectories.proprio),
-        goal=goal,
+        goal_relative=goal,
         action=take(trajectories.action),
-        target=take(trajectories.target),
+        label=take(trajectories.label),
         rtg=take(rtg),
         timestep=at + jax.random.randint(shift_key, (batch, 1), 0, shift_timestep + 1, jnp.int32),
         valid=valid.astype(jnp.float32),
-        learn=valid * take(trajectories.learn),
+        label_mask=valid * take(trajectories.label_mask),
         reward=take(trajectories.reward),
     )
     if symmetries is None:
@@ -284,7 +290,7 @@ def _see(
     map_cell_m: float,
 ) -> tuple[UInt8[Array, "B S 2 k k"], Float[Array, "B S 2"]]:  # fmt: skip
     """Local maps and vectors to the goal [m], at positions [m] in the mazes of the trajectories ``which``."""
-    goal = trajectories.goal[which]
+    goal = trajectories.goal_world[which]
     maze = jax.tree.map(lambda leaf: leaf[trajectories.maze[which]], mazes)
     see = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=map_cell_m), in_axes=(None, 0, None))
     return jax.vmap(see)(maze, position, goal), goal[:, None] - position
@@ -303,7 +309,7 @@ def mirror_windows(which: Int[Array, "B"], symmetries: Symmetries, window: Windo
     return window.replace(
         map=grid(window.map),
         proprio=transform(proprio, window.proprio),
-        goal=transform(world, window.goal),
+        goal_relative=transform(world, window.goal_relative),
         action=transform(action, window.action),
-        target=transform(action, window.target),
+        label=transform(action, window.label),
     )

@@ -31,7 +31,7 @@ from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
 GOAL_SCALE_M = 10.0  # goal vectors are divided by this
-RETURN_SCALE = 1000.0  # returns are divided by this
+RETURN_DIVISOR = 1000.0  # returns are divided by this
 SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
 
 
@@ -229,7 +229,7 @@ class SkillHead(nn.Module):
         mean, std, policy = jax.lax.stop_gradient(tuple(skill.value[name] for name in ("mean", "std", "policy")))
         sac = self.sac
         controller = SacController(
-            NestedMeanStd(mean, std), policy, self.action_size, sac.hidden, sac.frame, sac.effort
+            NestedMeanStd(mean, std), policy, self.action_size, sac.hidden, sac.frame, sac.action_scale
         )
         action = controller(body.reshape(-1, body.shape[-1]), where.reshape(-1, 2))
         return action.reshape(*where.shape[:-1], self.action_size)
@@ -303,7 +303,7 @@ class ControlTransformer(nn.Module):
         return self.embed_timestep(jnp.minimum(timestep, self.config.max_timestep - 1))
 
     def _embed_return(self, rtg: jax.Array) -> jax.Array:
-        known = rtg / RETURN_SCALE if self.config.returns else jnp.zeros_like(rtg)
+        known = rtg / RETURN_DIVISOR if self.config.returns else jnp.zeros_like(rtg)
         return self.embed_return(known[..., None])
 
     def _embed_state(self, maps: jax.Array, proprio: jax.Array, goal: jax.Array) -> jax.Array:

@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
-from ct_jax.transformer import GOAL_SCALE_M, RETURN_SCALE, MapEncoder, goal_features
+from ct_jax.transformer import GOAL_SCALE_M, RETURN_DIVISOR, MapEncoder, goal_features
 
 
 class ValueNetwork(nn.Module):
@@ -21,4 +21,4 @@ class ValueNetwork(nn.Module):
         x = jnp.concatenate([MapEncoder(self.width)(maps), proprio, goal_features(goal), distance / GOAL_SCALE_M], -1)
         for _ in range(2):
             x = nn.relu(nn.Dense(self.width)(x))
-        return -RETURN_SCALE * nn.softplus(nn.Dense(1)(x)[..., 0])
+        return -RETURN_DIVISOR * nn.softplus(nn.Dense(1)(x)[..., 0])

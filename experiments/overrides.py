@@ -7,7 +7,7 @@ LONG_CT = CT | {"fit.updates": 5000}
 LONG = {"last_fit.updates": 5000}  # twice the updates in the last training
 MODES_CT = CT | {"model.modes": 4}
 MODES = {"model.modes": 4, "model.commitment": 3.0}  # Commitment only for models that learned from failures.
-CALM = {"controller_effort": 0.75}  # share of the controller's range: walkers fall less; chosen in the training maze
+CALM = {"controller_action_scale": 0.75}  # walkers fall less; chosen in the training maze
 ROAM = {"recover.random_mazes": 100}  # CT trained in one maze; recoveries also from random mazes
 # Also trajectories and recoveries from 100 random mazes. CT and F-CT have the same total number of updates.
 MAZES = {

@@ -86,7 +86,7 @@ COLUMNS = """
 
 *planner* knows the whole map. *explorer* draws a map from the local maps that the transformer also sees, and replans:
 it is the alternative to a learned policy. Both lead the same low-level controller. "0.3 m margin" is what their
-roadmap keeps off walls beyond the robot's radius; "75% effort" is the share of the actuators' range that the
+roadmap keeps off walls beyond the robot's radius; "action scale 0.75" is the share of the actuators' range that the
 controller uses.
 """
 

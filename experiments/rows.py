@@ -99,7 +99,7 @@ class Row(Made, Scored):
 
     seen: bool | None = None  # the model was trained in this maze
     margin_m: float | None = None  # references: clearance of their roadmap beyond the robot's radius
-    effort: float | None = None  # references: share of the actuators' range that the controller uses
+    action_scale: float | None = None  # references: share of the actuators' range that the controller uses
     worlds: int | None = None  # rooms
     pairs: int | None = None  # in each room
     density: float | None = None  # of obstacles, 1 is the published one
@@ -114,7 +114,7 @@ class Row(Made, Scored):
         """The key of a row: a later row with the same key replaces it. References belong to no model."""
         model = () if self.method in GUIDED else (self.variant, self.model_seed)
         # Rows of early commits have no ``margin_m``; their margin was 0.
-        return (*model, self.method, self.maze, self.density, self.noise, self.margin_m or 0.0, self.effort)
+        return (*model, self.method, self.maze, self.density, self.noise, self.margin_m or 0.0, self.action_scale)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ from ct_jax.files import prepare_outputs
 from ct_jax.finetune import NoRecoveryError
 from ct_jax.mazes import evaluated
 from ct_jax.model import load_controller
-from ct_jax.presets import Settings, get_preset, to_dict
+from ct_jax.presets import get_preset
 from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
@@ -48,6 +48,7 @@ from ct_jax.run import (
     provenance,
     training,
 )
+from ct_jax.settings import Settings, to_dict
 from ct_jax.terminal import printable
 
 SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
@@ -218,7 +219,7 @@ class Study:
         """Train and evaluate all variants with each seed. If one fails, the others still run.
 
         If F-CT finds no recoveries to learn from, that is a result too: its reason is kept instead of a row. Planner
-        and explorer appear once for each roadmap margin and each effort.
+        and explorer appear once for each roadmap margin and each action scale.
 
         Args:
             keep: called after each model with all results so far.
@@ -270,8 +271,8 @@ def reference(run: Run) -> dict[str, float]:
     settings = run.settings
     if settings.rooms:
         return {}
-    effort = {"effort": settings.controller_effort} if settings.controller_effort != 1.0 else {}
-    return {"margin_m": settings.prm.margin_m} | effort
+    action_scale = {"action_scale": settings.controller_action_scale} if settings.controller_action_scale != 1.0 else {}
+    return {"margin_m": settings.prm.margin_m} | action_scale
 
 
 # ---------------------------------------------------------------------------------------------------------- stages
@@ -279,10 +280,10 @@ def reference(run: Run) -> dict[str, float]:
 # The settings that a stage depends on, besides those of the stage before it.
 STAGES = {
     "controller": ("prm", "controller", "sac"),
-    "collect": ("controller_effort", "collect", "rooms", "random_mazes"),
+    "collect": ("controller_action_scale", "collect", "rooms", "random_mazes"),
     "fit": ("model", "fit", "value"),
 }
-_REFERENCES = ("episodes", "pairs_seed", "controller_effort")
+_REFERENCES = ("episodes", "pairs_seed", "controller_action_scale")
 
 
 def stage_digests(run: Run) -> dict[str, str]:

@@ -15,6 +15,7 @@ from rows import CT, LISTS, CqlRow, Origin, Results, Row, TransferRow, Unmade
 from study import Variant, load_variants
 
 from ct_jax.evaluate import GUIDED
+from ct_jax.settings import from_dict, to_dict
 
 ZOO = Path(__file__).parents[1] / "ct_jax" / "zoo"
 LONGER = "long-ct"  # CT with about as many updates as F-CT has in all
@@ -76,7 +77,8 @@ def method_name(row: Row | Unmade, variants: Mapping[str, Variant]) -> str:
     """The name of a row in tables: the paper's name, the variant's name, or the reference with its settings."""
     if isinstance(row, Row) and row.method in GUIDED:
         margin = f", {row.margin_m:g} m margin" if row.margin_m else ""
-        return f"{row.method}{margin}" + (f", {row.effort:.0%} effort" if row.effort is not None else "")
+        scale = "" if row.action_scale is None else f", action scale {row.action_scale:g}"
+        return f"{row.method}{margin}{scale}"
     return label_of(row.variant, variants)
 
 
@@ -359,13 +361,14 @@ def model_card(robot: str, results: Results) -> dict[str, list[str]]:
     """The generated parts of a shipped model's card, by the names of their markers."""
     shipped: str = importlib.import_module(robot).SHIPPED
     model = json.loads((ZOO / robot / "model.json").read_text("utf-8"))
-    settings, seed = model["settings"], model["made"]["seed"]
-    led = (settings["prm"]["margin_m"], settings.get("controller_effort"))
+    settings, seed = to_dict(from_dict(model["settings"])), model["made"]["seed"]
+    scale = settings["controller_action_scale"]
+    led = (settings["prm"]["margin_m"], None if scale == 1.0 else scale)
 
     def beside(row: Row) -> bool:
-        """Whether a row is the shipped model's, or a reference's with the same margin and effort."""
+        """Whether a row is the shipped model's, or a reference's with the same margin and action scale."""
         if row.method in GUIDED:
-            return robot == "turtlebot3" or (row.margin_m, row.effort) == led
+            return robot == "turtlebot3" or (row.margin_m, row.action_scale) == led
         return (row.variant, row.model_seed, row.method) == (shipped, seed, CT)
 
     found = Results(*([row for row in getattr(results, name) if beside(row)] for name in LISTS))
@@ -376,10 +379,10 @@ def model_card(robot: str, results: Results) -> dict[str, list[str]]:
 
 
 def _facts(model: Mapping[str, Any], robot: str, shipped: str) -> list[str]:
-    settings, made = model["settings"], Origin.read(model["made"])
+    settings, made = to_dict(from_dict(model["settings"])), Origin.read(model["made"])
     net, collect, recover = settings["model"], settings["collect"], settings["recover"]
     rounds, last = settings["rounds"], settings["last_fit"] or settings["round_fit"]
-    fit, mazes = settings["fit"], settings.get("random_mazes")
+    fit, mazes = settings["fit"], settings["random_mazes"]
     where = f"in `antmaze-large` and {mazes} random mazes" if mazes else "in `antmaze-large`"
     where = "in random rooms" if robot == "turtlebot3" else where
     data = f"{collect['trajectories']} trajectories {where}, guided by the {collect['guide']}; "

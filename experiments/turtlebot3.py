@@ -38,7 +38,7 @@ SWEEPS = LISTS[1:]
 SWEPT_PAIRS = 10  # in each room of a sweep
 
 # Without fine-tuning: conditioned on half of V, and timesteps shifted at random.
-LIFTED_CT = {"rounds": 0, "optimism": 0.5, "fit.shift_timestep": 300}
+LIFTED_CT = {"rounds": 0, "return_scale": 0.5, "fit.shift_timestep": 300}
 NOISE = {"rooms.noise": 1.0}  # the errors of a real robot, in training
 DENSE = {"rooms.density": min(DENSITIES), "rooms.densest": max(DENSITIES)}
 
@@ -49,7 +49,7 @@ VARIANTS = {
     "bc-ct": Variant("published", {"rounds": 0, "model.returns": False}),
     "f-ct": Variant("published", tuned_from="ct"),
     "cpu-ct": Variant("cpu", LIFTED_CT, sweeps=SWEEPS),
-    "cpu-ct-v": Variant("cpu", LIFTED_CT | {"optimism": 1.0}),
+    "cpu-ct-v": Variant("cpu", LIFTED_CT | {"return_scale": 1.0}),
     "cpu-ct-actions": Variant("cpu", LIFTED_CT | {"model.actions": True}),
     "cpu": Variant("cpu", tuned_from="cpu-ct", sweeps=SWEEPS),
     "noise-ct": Variant("cpu", LIFTED_CT | NOISE, sweeps=("noise", "seven")),

@@ -138,7 +138,7 @@ def faulty():
     import jax.numpy as jnp
     from flax import struct
 
-    from ct_jax.rollout import act_as_meant
+    from ct_jax.rollout import act_as_intended
 
     @struct.dataclass
     class Faulty:
@@ -153,7 +153,7 @@ def faulty():
         def act(self, memory, state, key):
             bad = jnp.asarray(self.which) & (memory >= self.step)
             action = jnp.zeros((*bad.shape, self.size))
-            return act_as_meant(action.at[:, -1].set(jnp.where(bad, self.value, 0.0))), memory + 1
+            return act_as_intended(action.at[:, -1].set(jnp.where(bad, self.value, 0.0))), memory + 1
 
     return Faulty
 
@@ -175,11 +175,11 @@ def toy_data():
             position=draw(steps, 2, low=4.0, high=side_m - 4.0),
             proprio=np.stack([which, step], -1).astype(np.float32),
             action=draw(steps, 2),
-            target=draw(steps, 2),
+            label=draw(steps, 2),
             reward=draw(steps, low=-20.0, high=0.0),
-            learn=np.ones((n, steps), np.float32),
+            label_mask=np.ones((n, steps), np.float32),
             collision=(draw(steps) > 0.5).astype(np.float32),
-            goal=draw(2, low=4.0, high=side_m - 4.0),
+            goal_world=draw(2, low=4.0, high=side_m - 4.0),
             maze=rng.integers(0, mazes, n).astype(np.int32),
             length=np.asarray(lengths, np.int32),
         )
@@ -208,7 +208,7 @@ class TinyRun:
 @pytest.fixture(scope="session")
 def tiny_settings():
     """Settings of a run that takes seconds and learns nothing; every stage is there."""
-    from ct_jax import presets as p
+    from ct_jax import settings as p
 
     fit = p.FitConfig(updates=40, batch=4, steps=8)
     return p.Settings(

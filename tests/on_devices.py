@@ -65,7 +65,7 @@ def learner() -> tuple[Fit, dict]:
 
 def empty(n: int, steps: int) -> Trajectories:
     """Trajectories of the point robot of which nothing is known but their sizes."""
-    shapes = {"position": 2, "proprio": 2, "action": 2, "target": 2, "reward": 0, "learn": 0, "collision": 0}
+    shapes = {"position": 2, "proprio": 2, "action": 2, "label": 2, "reward": 0, "label_mask": 0, "collision": 0}
     arrays = {name: np.zeros((n, steps, size) if size else (n, steps), np.float32) for name, size in shapes.items()}
     counts = {name: np.zeros(n, np.int32) for name in ("maze", "length")}
     return Trajectories(**arrays, **counts, goal=np.zeros((n, 2), np.float32))
@@ -115,7 +115,7 @@ def drive() -> dict[str, np.ndarray]:
     """Episodes collected, and episodes of a policy."""
     env = MazeEnv("point", maps=False, auto_reset=False, horizon=COLLECT.horizon)
     found = collect(jax.random.key(2), env, MAZES, Push(), COLLECT, PRM)
-    collected = {name: devices.joined(np.asarray(getattr(found, name))) for name in ("length", "goal")}
+    collected = {name: devices.joined(np.asarray(getattr(found, name))) for name in ("length", "goal_world")}
     first_steps = devices.joined(np.asarray(found.position)[:, :2])
     value = ValueNetwork(8)
     value_params = init_params(jax.random.key(3), value, empty(1, 1))

@@ -16,7 +16,7 @@ from flax import struct
 import ct_jax
 from ct_envs import MazeEnv, load_maze
 from ct_jax.cli import main
-from ct_jax.rollout import act_as_meant
+from ct_jax.rollout import act_as_intended
 
 SUBMODULES = sorted(f"ct_jax.{module.name}" for module in pkgutil.iter_modules(ct_jax.__path__))
 
@@ -101,7 +101,7 @@ class Witness:
         return jnp.zeros(state.done.shape[0])
 
     def act(self, memory, state, key):
-        return act_as_meant(self(state.obs["proprio"], None)), memory
+        return act_as_intended(self(state.obs["proprio"], None)), memory
 
     def __call__(self, proprio, goal):
         one = jax.ShapeDtypeStruct((2, 2), jnp.float32)

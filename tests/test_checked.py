@@ -14,19 +14,8 @@ from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Share, Within, from_json, shown
 from ct_envs.turtlebot3 import Turtlebot3Config
 from ct_jax.baselines.cql import CqlConfig
-from ct_jax.presets import (
-    CollectConfig,
-    FitConfig,
-    ModelConfig,
-    PrmConfig,
-    RecoverConfig,
-    RoomConfig,
-    SacConfig,
-    Settings,
-    ValueConfig,
-    from_dict,
-    to_dict,
-)
+from ct_jax.presets import CollectConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, SacConfig, ValueConfig
+from ct_jax.settings import RoomConfig, Settings, from_dict, to_dict
 
 CONFIGS = [
     CollectConfig, CqlConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, RoomConfig, SacConfig, Settings,
@@ -102,8 +91,8 @@ WRONG = [
     (ModelConfig, {"frame": 1}, "frame is 1"),
     (ModelConfig, {"returns": 1}, "ModelConfig.returns is 1; give True or False"),
     (ModelConfig, {"dropout": 1.0}, "dropout is 1.0"),
-    (Settings, {"optimism": -3.0}, "Settings.optimism is -3.0; give a number above 0, at most 10"),
-    (Settings, {"optimism": "x"}, "optimism is 'x'"),
+    (Settings, {"return_scale": -3.0}, "Settings.return_scale is -3.0; give a number above 0, at most 10"),
+    (Settings, {"return_scale": "x"}, "return_scale is 'x'"),
     (Settings, {"model": None}, "Settings.model is None; give a ModelConfig"),
     (Settings, {"model": FitConfig()}, "give a ModelConfig"),
     (Settings, {"rooms": 3}, "give a RoomConfig or None"),

@@ -312,7 +312,7 @@ def test_json_errors_name_the_file_and_the_line(tmp_path):
 def test_numbers_and_depths_that_json_has_not_are_one_line(tmp_path, text, words):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(UserError, match=rf"x\.json: {words}.*; mend it") as caught:
-        read_json(tmp_path / "x.json", mend="mend it")
+        read_json(tmp_path / "x.json", hint="mend it")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 

@@ -38,6 +38,7 @@ TOPICS = {
     "fit": {"III-D"},
     "policy": {"III-D"},
     "presets": {"III-D", "III-G"},
+    "settings": {"III-D"},
     "evaluate_turtlebot3": {"IV-B"},
     "baselines": {"IV-A"},
     "cql": {"IV-A"},

@@ -16,7 +16,7 @@ import pytest
 from ct_envs.maze import maze_names
 from ct_jax import __version__, cli, pipeline
 from ct_jax.cli import main
-from ct_jax.presets import Settings
+from ct_jax.settings import Settings
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -99,18 +99,18 @@ def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
 
     @functools.wraps(pipeline._EVALUATIONS["maze"])
     def listen(model, method, seed, keep, **options):
-        asked.append(model.policy.optimism)
+        asked.append(model.policy.return_scale)
         keep(row := {"robot": model.robot})
         return row
 
     monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     rows = []
-    for more in ([], ["--optimism", "0.5"]):
+    for more in ([], ["--return_scale", "0.5"]):
         assert main([*command, *more]) == 0
         rows.append(json.loads(capsys.readouterr().out))
-    assert asked == [Settings().optimism, 0.5]
-    assert "optimism" not in rows[0] and rows[1]["optimism"] == 0.5
+    assert asked == [Settings().return_scale, 0.5]
+    assert "return_scale" not in rows[0] and rows[1]["return_scale"] == 0.5
 
 
 def test_without_pybullet_every_other_robot_works(tiny_run, monkeypatch, capsys):
@@ -155,7 +155,7 @@ def test_version(capsys):
         (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
         (
             ["evaluate"],
-            ["RUN", "--maze", "--episodes", "--seed", "--method", "--optimism", "--json", "zoo:point", "examples:"],
+            ["RUN", "--maze", "--episodes", "--seed", "--method", "--return_scale", "--json", "zoo:point", "examples:"],
         ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
@@ -219,9 +219,9 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
         (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
         (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
-        (["evaluate", "RUN", "--optimism", "0"], ["--optimism 0", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--optimism", "nan"], ["--optimism nan", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--optimism", "0.5", "--method", "explorer"], ["--optimism", "--method ct"]),
+        (["evaluate", "RUN", "--return_scale", "0"], ["--return_scale 0", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return_scale", "nan"], ["--return_scale nan", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return_scale", "0.5", "--method", "explorer"], ["--return_scale", "--method ct"]),
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "RUN", "--video", "walk.gif"], ["--video walk.gif", ".mp4"]),
@@ -269,11 +269,11 @@ def test_the_row_is_printed_before_anything_is_drawn(
         raise stop
 
     monkeypatch.setattr("ct_jax.report.pictures.write_paths", draw)
-    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--optimism", "0.5"]
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--return_scale", "0.5"]
     assert main([*command, "--picture", str(tmp_path / "p.png"), *["--json"] * as_json]) == status
     out = capsys.readouterr().out
     if as_json:
-        assert json.loads(out)["optimism"] == 0.5
+        assert json.loads(out)["return_scale"] == 0.5
     else:
         assert out.splitlines()[1].split()[:2] == ["antmaze-umaze", "ct"]
 

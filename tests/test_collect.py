@@ -54,10 +54,10 @@ def test_only_successes_and_only_at_the_end(collected):
 def test_rewards_are_minus_the_distance_to_the_final_goal(collected):
     data, _ = collected
     for i in range(data.n):
-        away = np.linalg.norm(after(data, i) - data.goal[i], axis=-1)
+        away = np.linalg.norm(after(data, i) - data.goal_world[i], axis=-1)
         np.testing.assert_allclose(data.reward[i, : data.length[i] - 1], -away, atol=1e-4)
-    assert (data.learn.sum(1) == data.length).all()
-    np.testing.assert_array_equal(data.target, data.action)
+    assert (data.label_mask.sum(1) == data.length).all()
+    np.testing.assert_array_equal(data.label, data.action)
 
 
 def test_trajectories_go_through_free_space_of_their_own_maze(collected, wall_distance):
@@ -72,8 +72,8 @@ def test_trajectories_go_through_free_space_of_their_own_maze(collected, wall_di
 def test_the_key_decides(collected, push):
     config = replace(SMALL, trajectories=3)
     first, other = (collect(jax.random.key(k), ENV, MAZES, push(), config, PRM) for k in (0, 1))
-    np.testing.assert_array_equal(first.goal, collected[0].goal[:3])
-    assert not np.array_equal(first.goal, other.goal)
+    np.testing.assert_array_equal(first.goal_world, collected[0].goal_world[:3])
+    assert not np.array_equal(first.goal_world, other.goal_world)
 
 
 def test_a_controller_that_never_arrives_is_an_error_and_no_hang(push):
@@ -90,7 +90,7 @@ def test_every_guide_arrives_with_noise_and_the_noise_is_not_imitated(push, guid
     config = replace(SMALL, trajectories=4, envs=4, guide=guide, noise=0.4, starts="maze")
     data = collect(jax.random.key(2), ENV, MAZES, push(), config, PRM)
     inside = np.arange(data.reward.shape[1]) < data.length[:, None]
-    np.testing.assert_array_equal(data.target, data.action)
+    np.testing.assert_array_equal(data.label, data.action)
     assert (np.abs(data.action[inside]) <= 1).all()
     # What was done differs from what was meant: with drag 20 N s/m, 5 kg and 80 N, speeds tell what was done.
     i = int(np.argmax(data.length))
@@ -144,7 +144,7 @@ def test_what_came_after_the_end_counts_for_nothing():
     steps = Steps(pairs, pairs, pairs, pairs, -ones, ones, alive, ones, ones)
     data = to_trajectories(steps, np.zeros((2, 2)), np.array([0, 1]))
     np.testing.assert_array_equal(data.length, [3, 2])
-    np.testing.assert_array_equal(data.learn, alive.T)
+    np.testing.assert_array_equal(data.label_mask, alive.T)
     np.testing.assert_array_equal(data.collision, alive.T)
     np.testing.assert_array_equal(np.asarray(data.rtg)[:, 0], [-3, -2])
     np.testing.assert_array_equal(data.position[1, 0], pairs[0, 1])

@@ -52,7 +52,7 @@ def fork(toy_data):
         proprio=np.zeros_like(data.proprio),
         action=np.where((odd & first)[..., None], left, right) + 0.05 * data.action,
         reward=np.where(odd & first, -8.0, -0.3).astype(np.float32),
-        goal=np.zeros_like(data.goal) + np.float32([6.8, 6]),
+        goal_world=np.zeros_like(data.goal_world) + np.float32([6.8, 6]),
         maze=np.zeros_like(data.maze),
     )
 
@@ -92,7 +92,7 @@ def test_every_step_is_drawn_alike_and_followed_by_the_next(arriving):
     inner = t + 1 < arriving.length[i]
     np.testing.assert_array_equal(batch.after.proprio[inner], np.stack([i, t + 1], -1)[inner])
     after = arriving.position[i, np.minimum(t + 1, 6)]
-    np.testing.assert_array_equal(batch.after.goal[inner], (arriving.goal[i] - after)[inner])
+    np.testing.assert_array_equal(batch.after.goal[inner], (arriving.goal_world[i] - after)[inner])
 
 
 def test_only_an_arrival_is_an_end(arriving):
@@ -184,8 +184,8 @@ def test_the_better_action_is_imitated(careful, fork):
     )
     action, memory = policy.act(policy.init(state), state, jax.random.key(0))
     again, _ = policy.act(memory, state, jax.random.key(1))
-    np.testing.assert_allclose(action.done[0], [0.7, 0.0], atol=0.3)
-    np.testing.assert_array_equal(action.done, again.done)  # without chance
+    np.testing.assert_allclose(action.executed[0], [0.7, 0.0], atol=0.3)
+    np.testing.assert_array_equal(action.executed, again.executed)  # without chance
     _, _, steps = rollout(env, policy, state, policy.init(state), jax.random.key(0), 5)
     assert np.isfinite(steps.reward).all()
 

@@ -20,7 +20,7 @@ import study
 from rows import RESULTS
 
 from ct_jax.cli import COMMANDS
-from ct_jax.presets import Settings
+from ct_jax.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))

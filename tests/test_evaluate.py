@@ -29,7 +29,7 @@ from ct_jax.evaluate import (
 from ct_jax.mazes import head
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
-from ct_jax.rollout import act_as_meant
+from ct_jax.rollout import act_as_intended
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
 
@@ -282,7 +282,7 @@ def test_any_policy_can_be_evaluated():
             return jnp.zeros(state.done.shape[0])
 
         def act(self, memory, state, key):
-            return act_as_meant(jnp.tile(jnp.array([[1.0, 0.0]]), (len(memory), 1))), memory + 1
+            return act_as_intended(jnp.tile(jnp.array([[1.0, 0.0]]), (len(memory), 1))), memory + 1
 
     two = Pairs(np.float32([[6, 6], [6, 6]]), np.float32([[12, 6], [6, 14]]), np.float32([6, 8]), 0)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=40)

@@ -41,8 +41,9 @@ from ct_jax.baselines.sac_alone import SacAlone
 from ct_jax.checkpoint import read_json
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import NoRecoveryError
-from ct_jax.presets import get_preset, with_fits
+from ct_jax.presets import get_preset
 from ct_jax.run import Run, load_mazes
+from ct_jax.settings import with_fits
 
 MADE = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00"}
 MAZE_ROBOTS = ("point", "ant", "humanoid")
@@ -100,7 +101,9 @@ def test_the_methods_of_the_table(robot):
     published, bc, fct = (variants[name] for name in ("published", "bc", "f-ct"))
     assert replace(bc, model=published.model) == published and not bc.model.returns
     assert fct.rounds == 1 and fct.recover.keep == "separate" and fct.collect == published.collect
-    assert not published.reprompt and published.collect.guide == "roadmap" and published.model.frame == "world"
+    assert (
+        not published.clip_target_return and published.collect.guide == "roadmap" and published.model.frame == "world"
+    )
     stuck = {"point": (40, 20), "ant": (80, 40), "humanoid": (120, 60)}
     assert (fct.recover.stuck_steps, fct.recover.bumps) == stuck[robot]
     lifted_ct, lifted = (variants[name] for name in ("cpu-ct", "cpu"))
@@ -115,7 +118,7 @@ def test_the_methods_of_the_table(robot):
         assert found == with_fits(replace(one, model=replace(one.model, skill=True)), turns=robot != "point")
     for name, one in (("memory-ct", lifted_ct), ("memory", lifted)):
         assert replace(variants[name], model=one.model) == one and variants[name].model.stride > 1
-        assert variants[f"calm+{name}"] == replace(variants[name], controller_effort=0.75)
+        assert variants[f"calm+{name}"] == replace(variants[name], controller_action_scale=0.75)
     for name in ("calm-ct", "calm"):
         one, longer = variants[name], variants[name.replace("calm", "calm+long")]
         assert fits_of(longer)[-1 if one.rounds else 0].updates == 2 * fits_of(one)[-1 if one.rounds else 0].updates
@@ -153,9 +156,9 @@ def test_the_turtlebots_rows_share_what_they_can():
     assert list(variants)[:4] == ["ct", "bc-ct", "f-ct", "cpu-ct"]
     assert list(variants)[4:] == ["cpu-ct-v", "cpu-ct-actions", "cpu", "noise-ct", "noise", "dense"]
     lifted, seeing = variants["cpu-ct"], variants["cpu-ct-actions"]
-    assert variants["cpu-ct-v"] == replace(lifted, optimism=1.0)
-    same = replace(variants["cpu"], rounds=0, optimism=lifted.optimism)
-    assert replace(same, fit=replace(same.fit, shift_timestep=300)) == lifted and lifted.optimism < 1.0
+    assert variants["cpu-ct-v"] == replace(lifted, return_scale=1.0)
+    same = replace(variants["cpu"], rounds=0, return_scale=lifted.return_scale)
+    assert replace(same, fit=replace(same.fit, shift_timestep=300)) == lifted and lifted.return_scale < 1.0
     assert replace(seeing, model=lifted.model) == lifted and seeing.model.actions and not lifted.model.actions
     densities = [variants[name].rooms.densities for name in ("cpu", "dense")]  # pyright: ignore
     assert densities == [(1.0, 1.0), (0.5, 2.0)]

@@ -11,10 +11,10 @@ from flax import struct
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
 from ct_jax.devices import data_mesh, fill_up
-from ct_jax.finetune import RecoverConfig, Supervised, Watching, lie_for_ever, recover
+from ct_jax.finetune import RecoverConfig, TakeoverPolicy, Watching, lie_for_ever, recover
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
-from ct_jax.rollout import Guided, act_as_meant
+from ct_jax.rollout import Guided, act_as_intended
 from ct_jax.trajectories import PER_STEP
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
@@ -39,7 +39,7 @@ class Blind:
         return ()
 
     def act(self, memory, state, key):
-        return act_as_meant(self.controller(state.obs["proprio"], state.obs["goal"])), memory
+        return act_as_intended(self.controller(state.obs["proprio"], state.obs["goal"])), memory
 
 
 def recoveries(own, push, seed=0, *, gain=1.0, **options):
@@ -61,14 +61,14 @@ def joined(push):
 
 
 def begins(data) -> np.ndarray:
-    return np.asarray(data.learn).argmax(1)
+    return np.asarray(data.label_mask).argmax(1)
 
 
 def test_joined_recoveries_teach_the_recovery_only(joined):
     begin = begins(joined)
     assert (begin >= CONFIG.stuck_steps).all()  # it takes so long to see that it is stuck
-    t = np.arange(joined.learn.shape[1])
-    np.testing.assert_array_equal(joined.learn, (t >= begin[:, None]) & (t < joined.length[:, None]))
+    t = np.arange(joined.label_mask.shape[1])
+    np.testing.assert_array_equal(joined.label_mask, (t >= begin[:, None]) & (t < joined.length[:, None]))
     last = joined.reward[np.arange(joined.n), joined.length - 1]
     assert (last > -POINT.goal_tolerance_m).all()  # every one of them arrived
 
@@ -93,12 +93,12 @@ def test_separate_recoveries_join_to_the_whole(joined, push):
         begin, end = pieces.length[i], joined.length[i]
         for name in PER_STEP:
             first, second = (getattr(pieces, name)[k, : pieces.length[k]] for k in (i, n + i))
-            if name == "learn":  # as trajectories of their own, both are imitated (paper)
+            if name == "label_mask":  # as trajectories of their own, both are imitated (paper)
                 assert first.all() and second.all()
                 continue
             np.testing.assert_array_equal(first, getattr(joined, name)[i, :begin], err_msg=name)
             np.testing.assert_array_equal(second, getattr(joined, name)[i, begin:end], err_msg=name)
-    np.testing.assert_array_equal(pieces.goal, np.tile(joined.goal, (2, 1)))
+    np.testing.assert_array_equal(pieces.goal_world, np.tile(joined.goal_world, (2, 1)))
     assert all(np.asarray(getattr(pieces, name)).dtype == np.float32 for name in PER_STEP)
 
 
@@ -116,8 +116,10 @@ def test_patience_ends(push):
 
 def test_the_planner_may_take_over_by_chance(push):
     data = recoveries(Blind(push(0.0)), push, keep="separate", takeover=1.0)
-    assert data.n <= 2 * N and (data.learn.sum(1) == data.length).all()
-    assert len({tuple(goal) for goal in data.goal}) == data.n  # the failures before it have no steps: none is kept
+    assert data.n <= 2 * N and (data.label_mask.sum(1) == data.length).all()
+    assert (
+        len({tuple(goal) for goal in data.goal_world}) == data.n
+    )  # the failures before it have no steps: none is kept
 
 
 def supervised_walk(push, keep: str, steps: int = 12):
@@ -125,7 +127,7 @@ def supervised_walk(push, keep: str, steps: int = 12):
     guide = make_guide("shortcut", ENV, PRM)
     batch = draw_batch(jax.random.key(4), ENV, MAZES, COLLECTING, PRM)
     plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-    supervised = Supervised(Blind(push(0.2)), Guided(push(), guide), replace(CONFIG, keep=keep))
+    supervised = TakeoverPolicy(Blind(push(0.2)), Guided(push(), guide), replace(CONFIG, keep=keep))
     memory = supervised.init(batch.state, (), supervised.guided.init(batch.state, plan))
 
     @jax.jit
@@ -133,7 +135,7 @@ def supervised_walk(push, keep: str, steps: int = 12):
         guided, _ = supervised.guided.act(memory.guided, state, jax.random.key(0))
         own, _ = supervised.own.act((), state, jax.random.key(0))
         action, after = supervised.act(memory, state, jax.random.key(0))
-        return jax.vmap(ENV.step)(state, action.done), after, (action, own, guided)
+        return jax.vmap(ENV.step)(state, action.executed), after, (action, own, guided)
 
     state, record = batch.state, []
     for _ in range(steps):
@@ -146,25 +148,25 @@ def supervised_walk(push, keep: str, steps: int = 12):
 def test_who_acts_and_who_is_imitated(push, keep):
     seen = set()
     for action, own, guided, rescued in supervised_walk(push, keep):
-        who = np.where(rescued[:, None], guided.done, own.done)
-        np.testing.assert_array_equal(action.done, who)
-        np.testing.assert_array_equal(action.meant, who)
+        who = np.where(rescued[:, None], guided.executed, own.executed)
+        np.testing.assert_array_equal(action.executed, who)
+        np.testing.assert_array_equal(action.intended, who)
         if keep == "relabelled":
-            np.testing.assert_array_equal(action.target, guided.target)
-            np.testing.assert_array_equal(action.learn, 1.0)
+            np.testing.assert_array_equal(action.label, guided.label)
+            np.testing.assert_array_equal(action.label_mask, 1.0)
         else:
-            np.testing.assert_array_equal(action.learn, rescued)
-            np.testing.assert_array_equal(np.asarray(action.target)[rescued], np.asarray(guided.target)[rescued])
+            np.testing.assert_array_equal(action.label_mask, rescued)
+            np.testing.assert_array_equal(np.asarray(action.label)[rescued], np.asarray(guided.label)[rescued])
         seen |= set(rescued.tolist())
     assert seen == {False, True}
 
 
 def test_relabelled_steps_all_teach(push):
     data = recoveries(Blind(push(0.2)), push, keep="relabelled")
-    assert (data.learn.sum(1) == data.length).all()
-    inside = np.arange(data.learn.shape[1]) < data.length[:, None]
-    assert np.abs(data.target - data.action)[inside].max() > 0.5  # what was done is not what is taught
-    assert (np.abs(data.target[inside]) <= 1).all()
+    assert (data.label_mask.sum(1) == data.length).all()
+    inside = np.arange(data.label_mask.shape[1]) < data.length[:, None]
+    assert np.abs(data.label - data.action)[inside].max() > 0.5  # what was done is not what is taught
+    assert (np.abs(data.label[inside]) <= 1).all()
 
 
 def test_a_policy_that_never_fails_and_a_planner_that_never_saves_end(push):
@@ -186,16 +188,16 @@ def test_without_compilation(push):
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False)
     guide = make_guide("explorer", env, PRM)
     batch = draw_batch(jax.random.key(0), env, MAZES, replace(COLLECTING, envs=2), PrmConfig(samples=20))
-    supervised = Supervised(own, Guided(push(), guide, 0.1), replace(CONFIG, stuck_steps=1))
+    supervised = TakeoverPolicy(own, Guided(push(), guide, 0.1), replace(CONFIG, stuck_steps=1))
     memory = supervised.init(batch.state, own.init(batch.state), supervised.guided.init(batch.state, guide.init(batch.state.info["maze"])))  # fmt: skip # noqa: E501
-    expected, _ = jax.jit(Supervised.act)(supervised, memory, batch.state, jax.random.key(1))
+    expected, _ = jax.jit(TakeoverPolicy.act)(supervised, memory, batch.state, jax.random.key(1))
     with jax.disable_jit():
         action, after = supervised.act(memory, batch.state, jax.random.key(1))
         assert not after.rescued.any()
-    np.testing.assert_allclose(action.done, expected.done, atol=1e-4)
-    _, after = jax.jit(Supervised.act)(supervised, after, batch.state, jax.random.key(2))
+    np.testing.assert_allclose(action.executed, expected.executed, atol=1e-4)
+    _, after = jax.jit(TakeoverPolicy.act)(supervised, after, batch.state, jax.random.key(2))
     assert after.rescued.all()
-    assert jnp.isfinite(action.target).all()
+    assert jnp.isfinite(action.label).all()
 
 
 def test_a_fall_is_paid_until_the_horizon(toy_data):
@@ -208,7 +210,9 @@ def test_a_fall_is_paid_until_the_horizon(toy_data):
 
 def test_touching_walls_time_and_again_is_a_failure(push):
     guide = make_guide("explorer", ENV, PRM)
-    supervised = Supervised(Blind(push()), Guided(push(), guide), replace(CONFIG, bumps=2, stuck_m=0.0, patience=99))
+    supervised = TakeoverPolicy(
+        Blind(push()), Guided(push(), guide), replace(CONFIG, bumps=2, stuck_m=0.0, patience=99)
+    )
     touched = jnp.zeros((CONFIG.stuck_steps, 3)).at[-2:, 1].set(1.0).at[0, 2].set(1.0)
     past = jnp.full((CONFIG.stuck_steps, 3, 2), jnp.inf)
     memory = Watching(None, None, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(3, bool))
@@ -222,7 +226,7 @@ def test_a_fault_is_paid_like_a_fall_and_teaches_nothing_that_is_no_number(push,
     data = recoveries(own, push, keep="relabelled", recoveries=N)
     finite = jax.tree.map(lambda leaf: bool(np.isfinite(leaf).all()), data)
     assert all(jax.tree.leaves(finite)), finite
-    away = np.linalg.norm(np.asarray(data.goal) - np.asarray(data.position)[:, 0], axis=-1)
+    away = np.linalg.norm(np.asarray(data.goal_world) - np.asarray(data.position)[:, 0], axis=-1)
     faults = np.asarray(data.length) == 4
     assert faults.sum() >= N - 1  # but for a start at the goal
     np.testing.assert_allclose(np.asarray(data.rtg)[faults, 0], -ENV.horizon * away[faults], rtol=1e-3)

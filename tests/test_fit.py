@@ -36,7 +36,7 @@ MODEL = ControlTransformer(
 @pytest.fixture(scope="module")
 def data(toy_data):
     data = toy_data([9, 17, 20], seed=1)
-    return data.replace(target=np.tanh(data.position - 10.0), proprio=data.position / 10.0)
+    return data.replace(label=np.tanh(data.position - 10.0), proprio=data.position / 10.0)
 
 
 @pytest.fixture(scope="module")
@@ -151,30 +151,30 @@ def test_an_interrupted_training_goes_on_to_the_same_end(learner, params, data, 
 
 
 def test_what_is_not_to_be_imitated_teaches_nothing(data, params):
-    data = data.replace(learn=(np.random.default_rng(0).random(data.learn.shape) < 0.5).astype(np.float32))
+    data = data.replace(label_mask=(np.random.default_rng(0).random(data.label_mask.shape) < 0.5).astype(np.float32))
     window = sample_windows(jax.random.key(0), data, data.rtg, MAZES, batch=8, steps=3, map_cell_m=0.8)
-    assert 0 < window.learn.mean() < 1
+    assert 0 < window.label_mask.mean() < 1
     grad = jax.jit(jax.value_and_grad(transformer_loss(MODEL)))
     shown = grad(params, window, jax.random.key(1))
-    other = window.replace(target=jnp.where(window.learn[..., None] > 0, window.target, 1e3))
+    other = window.replace(label=jnp.where(window.label_mask[..., None] > 0, window.label, 1e3))
     assert same(shown, grad(params, other, jax.random.key(1)))
-    nothing = grad(params, window.replace(learn=0 * window.learn), jax.random.key(1))
+    nothing = grad(params, window.replace(label_mask=0 * window.label_mask), jax.random.key(1))
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(nothing))
-    half = window.replace(learn=0.5 * window.learn)  # a weight of all is no weight
+    half = window.replace(label_mask=0.5 * window.label_mask)  # a weight of all is no weight
     np.testing.assert_allclose(grad(params, half, jax.random.key(1))[0], shown[0], rtol=1e-5)
 
 
 def test_two_modes_learn_either_way_where_one_learns_neither(data):
     """Half of the pieces are told left, half right: one mode's best is between them, of two each takes a side."""
     window = sample_windows(jax.random.key(0), data, data.rtg, MAZES, batch=8, steps=3, map_cell_m=0.8)
-    window = window.replace(target=jnp.where(jnp.arange(8)[:, None, None] < 4, 1.0, -1.0) + 0 * window.target)
-    window = window.replace(learn=jnp.ones_like(window.learn))
+    window = window.replace(label=jnp.where(jnp.arange(8)[:, None, None] < 4, 1.0, -1.0) + 0 * window.label)
+    window = window.replace(label_mask=jnp.ones_like(window.label_mask))
 
     def loss_of(action, logit):
         model = SimpleNamespace(apply=lambda *inputs, **options: Modes(jnp.asarray(action), jnp.asarray(logit)))
         return float(transformer_loss(model)({}, window, jax.random.key(0)))
 
-    steps, size = window.rtg.shape, window.target.shape[-1]
+    steps, size = window.rtg.shape, window.label.shape[-1]
     one = lambda value: loss_of(np.full((*steps, 1, size), value, np.float32), np.zeros((*steps, 1), np.float32))  # noqa: E731
     assert np.allclose([one(0.0), one(1.0), one(0.5)], [1.0, 2.0, (0.25 + 2.25) / 2], rtol=1e-5)  # the squared error
     sides = np.broadcast_to(np.array([1.0, -1.0], np.float32)[:, None], (*steps, 2, size))
@@ -184,7 +184,7 @@ def test_two_modes_learn_either_way_where_one_learns_neither(data):
 
 
 def score(data):
-    straight = np.linalg.norm(data.goal - data.position[:, 0], axis=1)
+    straight = np.linalg.norm(data.goal_world - data.position[:, 0], axis=1)
     return np.asarray(data.rtg)[:, 0] / np.maximum(straight, 1.0) ** 2
 
 

@@ -199,10 +199,10 @@ def assert_one_line(call, *parts: str) -> None:
         (b"#\n" * 2000, "", "at most 1024 x 1024"),
     ],
 )
-def test_files_that_are_no_mazes_are_named_with_line_and_mend(tmp_path, content, line, mend):
+def test_files_that_are_no_mazes_are_named_with_line_and_mend(tmp_path, content, line, hint):
     file = tmp_path / "floor.txt"
     file.write_bytes(content)
-    assert_one_line(lambda: load_maze(file), f"{file}{line}", mend)
+    assert_one_line(lambda: load_maze(file), f"{file}{line}", hint)
 
 
 def test_a_giant_file_is_refused_at_once(tmp_path):

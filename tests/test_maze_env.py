@@ -264,7 +264,7 @@ def test_auto_reset_tells_of_the_finished_episode_and_begins_a_fresh_one(wall_di
         after, plain = step(state, action), plain_step(state.replace(done=jnp.zeros(N)), action)
         for name in ("success", "truncation", "collision"):
             np.testing.assert_array_equal(after.info[name], plain.info[name])
-        np.testing.assert_array_equal(after.done, plain.done)
+        np.testing.assert_array_equal(after.done, plain.executed)
         np.testing.assert_allclose(after.reward, plain.reward, rtol=1e-5)
         done = np.asarray(after.done) > 0
         pick = lambda state: (state.pipeline_state, state.obs, state.info["goal"], state.info["episode_steps"])  # noqa: E731

@@ -21,7 +21,7 @@ from ct_jax.model import (
     save_model,
     zoo_names,
 )
-from ct_jax.presets import Settings
+from ct_jax.settings import Settings
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
@@ -30,8 +30,8 @@ SETTINGS = Settings(
     model=ModelConfig(layers=2, heads=2, width=8, context=3, context_acting=5, max_timestep=16),
     value=ValueConfig(width=8),
     sac=SacConfig(hidden=(8, 4)),
-    optimism=0.8,
-    reprompt=True,
+    return_scale=0.8,
+    clip_target_return=True,
 )
 
 
@@ -76,7 +76,7 @@ def test_it_acts_as_before(model, tmp_path):
     np.testing.assert_array_equal(act(found.policy, maps, proprio, goal), act(model.policy, maps, proprio, goal))
     np.testing.assert_array_equal(found.controller(proprio, goal), model.controller(proprio, goal))
     assert (found.robot, found.settings, found.made) == (model.robot, model.settings, model.made)
-    assert (found.policy.optimism, found.policy.reprompt) == (0.8, True)
+    assert (found.policy.return_scale, found.policy.clip_target_return) == (0.8, True)
     for a, b in zip(jax.tree.leaves(found.controller), jax.tree.leaves(model.controller), strict=True):
         np.testing.assert_array_equal(a, b)
         assert np.shape(a) == np.shape(b) and a.dtype == b.dtype

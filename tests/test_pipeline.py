@@ -24,9 +24,9 @@ from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
 from ct_jax.mazes import evaluated
 from ct_jax.model import load_model
-from ct_jax.presets import Settings
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, load_mazes, maze_text, open_run, random_mazes
+from ct_jax.settings import Settings
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -152,7 +152,7 @@ def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, t
     """Whatever comes to lie where it came from."""
     source = tmp_path / "source"
     shutil.copytree(tiny_run.folder / "controller", source / "controller")
-    settings = dataclasses.replace(tiny_settings, controller=str(source), controller_effort=0.5)
+    settings = dataclasses.replace(tiny_settings, controller=str(source), controller_action_scale=0.5)
     run = make_run(tmp_path / "run", settings)
     with open_run(run, resume=False), contextlib.closing(Metrics(run.folder)) as metrics:
         given, config = mazes.MazeCourse(run).controller(metrics)
@@ -161,7 +161,7 @@ def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, t
     jax.tree.map(np.testing.assert_array_equal, given, again)
     done = run.done("controller")
     assert done is not None and done["given"] == str(source)
-    assert given.effort == config.effort == 0.5 * tiny_settings.sac.effort
+    assert given.action_scale == config.action_scale == 0.5 * tiny_settings.sac.action_scale
 
 
 def test_the_random_mazes_are_always_the_same():

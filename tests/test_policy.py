@@ -45,7 +45,7 @@ def walk(policy, state):
         state, memory = carry
         value = VALUE.apply(policy.value_params, *(state.obs[name] for name in ("map", "proprio", "goal")))
         action, memory = policy.act(memory, state, key)
-        after = jax.vmap(ENV.step)(state, action.done)
+        after = jax.vmap(ENV.step)(state, action.executed)
         return (after, memory), (memory.rtg, value, after.reward, action)
 
     return jax.lax.scan(once, (state, policy.init(state)), jax.random.split(jax.random.key(0), STEPS))[1]
@@ -53,15 +53,15 @@ def walk(policy, state):
 
 @pytest.mark.parametrize("k", [1.0, 0.7, 1.5])
 def test_the_return_asked_for_is_k_v_and_then_what_is_left_of_it(policy, start, k):
-    rtg, value, reward, _ = map(np.asarray, jax.tree.leaves(walk(policy.replace(optimism=k), start))[:4])
-    np.testing.assert_allclose(policy.replace(optimism=k).init(start).rtg, k * value[0], rtol=1e-5)
+    rtg, value, reward, _ = map(np.asarray, jax.tree.leaves(walk(policy.replace(return_scale=k), start))[:4])
+    np.testing.assert_allclose(policy.replace(return_scale=k).init(start).rtg, k * value[0], rtol=1e-5)
     np.testing.assert_allclose(rtg[0], k * value[0], rtol=1e-5)
     np.testing.assert_allclose(rtg[1:], rtg[:-1] - reward[:-1], rtol=1e-5)
     assert (rtg[1:] > rtg[:-1]).all()  # rewards are negative, so ever less is left
 
 
 def test_with_reprompt_no_more_is_asked_for_than_v(policy, start):
-    rtg, value, reward, _ = map(np.asarray, jax.tree.leaves(walk(policy.replace(reprompt=True), start))[:4])
+    rtg, value, reward, _ = map(np.asarray, jax.tree.leaves(walk(policy.replace(clip_target_return=True), start))[:4])
     assert (rtg <= value + 1e-3).all()
     np.testing.assert_allclose(rtg[1:], np.minimum(rtg[:-1] - reward[:-1], value[1:]), rtol=1e-5)
     plain = np.asarray(walk(policy, start)[0])
@@ -70,9 +70,9 @@ def test_with_reprompt_no_more_is_asked_for_than_v(policy, start):
 
 def test_actions_are_within_bounds_meant_and_done(policy, start):
     action = walk(policy, start)[3]
-    assert (np.abs(action.done) <= 1).all() and np.ptp(action.done) > 0.1
-    np.testing.assert_array_equal(action.meant, action.done)
-    np.testing.assert_array_equal(action.target, action.done)
+    assert (np.abs(action.executed) <= 1).all() and np.ptp(action.executed) > 0.1
+    np.testing.assert_array_equal(action.intended, action.executed)
+    np.testing.assert_array_equal(action.label, action.executed)
 
 
 def test_a_policy_acts_on_a_window_as_its_settings_say(policy, start):
@@ -84,8 +84,8 @@ def test_a_policy_acts_on_a_window_as_its_settings_say(policy, start):
     window = cached.replace(config=replace(deep, acting="window"))
     (rtg, _, _, kept), (rtg_window, _, _, anew) = walk(cached, start), walk(window, start)
     np.testing.assert_allclose(rtg[: CONFIG.context], rtg_window[: CONFIG.context], rtol=1e-5)
-    np.testing.assert_allclose(kept.done[: CONFIG.context], anew.done[: CONFIG.context], atol=1e-4)
-    assert np.abs(np.asarray(kept.done) - anew.done).max() > 1e-4
+    np.testing.assert_allclose(kept.executed[: CONFIG.context], anew.executed[: CONFIG.context], atol=1e-4)
+    assert np.abs(np.asarray(kept.executed) - anew.executed).max() > 1e-4
 
 
 def test_a_rollout_is_the_forward_pass_on_what_it_recorded(policy, start):
@@ -117,9 +117,9 @@ def test_a_rollout_is_the_forward_pass_on_what_it_recorded(policy, start):
 def test_behaviour_cloning_asks_for_nothing(policy, start):
     """Without returns, k changes what is kept in memory but nothing that is done."""
     cloned = policy.replace(config=replace(CONFIG, returns=False))
-    one, other = (walk(cloned.replace(optimism=k), start)[3].done for k in (1.0, 3.0))
+    one, other = (walk(cloned.replace(return_scale=k), start)[3].executed for k in (1.0, 3.0))
     np.testing.assert_array_equal(one, other)
-    one, other = (walk(policy.replace(optimism=k), start)[3].done for k in (1.0, 3.0))
+    one, other = (walk(policy.replace(return_scale=k), start)[3].executed for k in (1.0, 3.0))
     assert np.abs(np.asarray(one) - other).max() > 1e-3
 
 
@@ -128,5 +128,5 @@ def test_without_compilation(policy, start):
     action, after = jax.jit(TransformerPolicy.act)(policy, memory, start, jax.random.key(0))
     with jax.disable_jit():
         plain, plain_after = policy.act(policy.init(start), start, jax.random.key(0))
-    np.testing.assert_allclose(plain.done, action.done, atol=1e-5)
+    np.testing.assert_allclose(plain.executed, action.executed, atol=1e-5)
     np.testing.assert_allclose(plain_after.rtg, after.rtg, rtol=1e-5)

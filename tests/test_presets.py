@@ -7,7 +7,8 @@ import pytest
 
 from ct_envs import UserError
 from ct_jax.fit import FitConfig
-from ct_jax.presets import _LATER, PRESETS, Settings, from_dict, get_preset, to_dict
+from ct_jax.presets import PRESETS, get_preset
+from ct_jax.settings import Settings, from_dict, to_dict
 from ct_jax.transformer import ModelConfig
 
 ALL = (
@@ -31,12 +32,39 @@ def test_settings_survive_being_written(name):
     assert hash(again) == hash(settings)
 
 
-def test_settings_that_came_later_are_written_only_where_they_say_something():
-    """So that a run of before goes on; and what is left out means the default."""
-    words = json.dumps(to_dict(Settings()))
-    assert not [name for name in _LATER if f'"{name}"' in words]
-    words = json.dumps(asdict(Settings()))
-    assert all(f'"{name}": {json.dumps(value)}' in words for name, value in _LATER.items())
+OLD_NAMES = {
+    "return_scale": "optimism", "clip_target_return": "reprompt", "controller_action_scale": "controller_effort",
+    "action_scale": "effort",
+}  # fmt: skip
+# What a file of format 1 meant by leaving a setting out.
+LEFT_OUT = {
+    "most_samples": 25_600, "acting": "cache", "rooms": None, "random_mazes": 0, "controller_action_scale": 1.0,
+    "modes": 1, "commitment": 0.0, "skill": False, "stride": 1, "turns": False, "precision": "float32",
+}  # fmt: skip
+
+
+def as_format_1(values):
+    """What the first version wrote of the same settings."""
+    if not isinstance(values, dict):
+        return values
+    return {
+        OLD_NAMES.get(name, name): as_format_1(value)
+        for name, value in values.items()
+        if name not in LEFT_OUT or value != LEFT_OUT[name]
+    }
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_files_of_the_first_version_mean_what_they_meant(name):
+    old = as_format_1(asdict(ALL[name]))
+    assert not any(f'"{new}"' in json.dumps(old) for new in OLD_NAMES)
+    assert from_dict(json.loads(json.dumps(old))) == ALL[name]
+
+
+@pytest.mark.parametrize("number", [0, 3, 2.0, "2", True, None])
+def test_settings_of_an_unknown_format_are_refused(number):
+    with pytest.raises(UserError, match=r"format .*; this version reads 1 to 2"):
+        from_dict(to_dict(Settings()) | {"format": number})
 
 
 def test_an_unknown_preset_lists_the_known():

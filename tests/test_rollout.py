@@ -8,7 +8,7 @@ from flax import struct
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
 from ct_jax.collect import run_episodes, start_episodes
-from ct_jax.rollout import Guided, act_as_meant, broke_off, rollout
+from ct_jax.rollout import Guided, act_as_intended, broke_off, rollout
 
 N = 4
 ENV = MazeEnv("point", engine="mujoco", auto_reset=False, maps=False, horizon=9)
@@ -64,10 +64,10 @@ def test_a_disturbance_is_done_but_not_meant(start, push):
     act = jax.jit(Guided.act)
     for key in jax.random.split(jax.random.key(0), 200):
         action, memory = act(guided, memory, start, key)
-        record.append(np.asarray(action.done - action.meant))
-        np.testing.assert_array_equal(action.meant, guided.intend(jnp.zeros(()), start)[0])
-        np.testing.assert_array_equal(action.target, action.meant)
-        np.testing.assert_array_equal(action.learn, 1.0)
+        record.append(np.asarray(action.executed - action.intended))
+        np.testing.assert_array_equal(action.intended, guided.intend(jnp.zeros(()), start)[0])
+        np.testing.assert_array_equal(action.label, action.intended)
+        np.testing.assert_array_equal(action.label_mask, 1.0)
     record = np.array(record)
     assert abs(record[20:].mean()) < 0.2 and 0.35 < record[20:].std() < 0.65
     held = (np.abs(np.diff(record, axis=0)) < 1e-6).all(-1)
@@ -80,7 +80,7 @@ def test_without_noise_nothing_is_drawn(start, push):
     memory = guided.init(start, jnp.zeros(()))
     one, other = (guided.act(memory, start, jax.random.key(seed))[0] for seed in (0, 1))
     jax.tree.map(np.testing.assert_array_equal, one, other)
-    np.testing.assert_array_equal(one.done, one.meant)
+    np.testing.assert_array_equal(one.executed, one.intended)
 
 
 def test_episodes_run_in_chunks_until_all_are_over(start, push):
@@ -99,10 +99,10 @@ def test_episodes_run_in_chunks_until_all_are_over(start, push):
 
 
 def test_as_meant():
-    action = act_as_meant(jnp.ones((3, 2)))
+    action = act_as_intended(jnp.ones((3, 2)))
     for leaf in action[:3]:
         np.testing.assert_array_equal(leaf, np.ones((3, 2)))
-    np.testing.assert_array_equal(action.learn, np.ones(3))
+    np.testing.assert_array_equal(action.label_mask, np.ones(3))
 
 
 def test_without_compilation(start, push):
@@ -119,7 +119,7 @@ def test_what_is_not_finite_is_neither_recorded_nor_imitated(start, faulty, bad)
     which = jnp.array([False, False, True, False])
     state, _, steps = rollout(ENV, faulty(which, bad), start, jnp.zeros((), jnp.int32), jax.random.key(0), 9)
     jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), steps)
-    learn = np.asarray(steps.learn)
+    learn = np.asarray(steps.label_mask)
     assert not learn[3:, 2].any() and learn[:3].all() and learn[:, ~which].all()
     np.testing.assert_array_equal(steps.alive.sum(0), [1, 9, 4, 9])
     np.testing.assert_array_equal(state.info["diverged"], which)

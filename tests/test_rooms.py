@@ -15,7 +15,7 @@ from flax import struct
 from ct_envs import UserError
 from ct_envs.turtlebot3 import Turtlebot3Config
 from ct_envs.turtlebot3_pool import Turtlebot3Pool
-from ct_jax import cli, mazes, pipeline, presets, rooms
+from ct_jax import cli, mazes, pipeline, presets, rooms, settings
 from ct_jax.cli import main
 from ct_jax.collect import CollectConfig
 from ct_jax.collect_turtlebot3 import keeping
@@ -26,7 +26,7 @@ from ct_jax.finetune import RecoverConfig
 from ct_jax.finetune_turtlebot3 import recover
 from ct_jax.fit import FitConfig
 from ct_jax.model import load_model
-from ct_jax.rollout import act_as_meant
+from ct_jax.rollout import act_as_intended
 from ct_jax.trajectories import load, unpack_maps
 
 pytestmark = [
@@ -40,7 +40,7 @@ TINY = replace(
     presets.TURTLEBOT3_CPU,
     collect=COLLECT,
     model=replace(presets.TURTLEBOT3_CPU.model, layers=1, heads=2, width=16),
-    value=presets.ValueConfig(fit=replace(FIT, steps=1), width=16),
+    value=settings.ValueConfig(fit=replace(FIT, steps=1), width=16),
     fit=FIT,
     rounds=1,
     round_fit=FIT,
@@ -89,8 +89,8 @@ def test_what_was_seen_is_kept(trained):
         maps = np.asarray(unpack_maps(data.map_bits[i, :length]))
         assert maps[:, 0].any() and (maps[:, 1].sum((1, 2)) <= 1).all()
         np.testing.assert_allclose(
-            np.linalg.norm(data.seen[i, :length], axis=-1),
-            np.linalg.norm(data.goal[i] - data.position[i, :length], axis=-1), atol=1e-4,
+            np.linalg.norm(data.goal_relative[i, :length], axis=-1),
+            np.linalg.norm(data.goal_world[i] - data.position[i, :length], axis=-1), atol=1e-4,
         )  # fmt: skip
 
 
@@ -189,7 +189,7 @@ class Ahead:
         return jnp.zeros(())
 
     def act(self, memory, state, key):
-        return act_as_meant(jnp.tile(jnp.array([1.0, 0.0]), (len(state.done), 1))), memory
+        return act_as_intended(jnp.tile(jnp.array([1.0, 0.0]), (len(state.done), 1))), memory
 
 
 CONFIG = RecoverConfig(recoveries=1, stuck_steps=10, stuck_m=0.05, patience=150, keep="joined")
@@ -211,7 +211,7 @@ def test_the_planner_brings_home_whom_it_takes_over(recoveries):
     joined = recoveries()
     last = joined.reward[np.arange(joined.n), joined.length - 1]
     assert joined.n >= 1 and (last > -1.3).all()
-    for i, begin in enumerate(joined.learn.argmax(1)):
+    for i, begin in enumerate(joined.label_mask.argmax(1)):
         np.testing.assert_allclose(joined.action[i, :begin], np.tile([1.0, 0.0], (begin, 1)))
         position = joined.position[i]
         stuck = np.linalg.norm(position[begin] - position[max(begin - CONFIG.stuck_steps, 0)]) < CONFIG.stuck_m
@@ -224,8 +224,8 @@ def test_the_planner_brings_home_whom_it_takes_over(recoveries):
 def test_relabelled_steps_are_all_told_what_the_planner_would_do(recoveries):
     data = recoveries(keep="relabelled")
     for i, length in enumerate(data.length):
-        assert (data.learn[i, :length] == 1).all()
-        assert np.abs(data.target[i, :length] - data.action[i, :length]).max() > 0.05
+        assert (data.label_mask[i, :length] == 1).all()
+        assert np.abs(data.label[i, :length] - data.action[i, :length]).max() > 0.05
 
 
 def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
@@ -237,7 +237,7 @@ def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
             raise KeyboardInterrupt
         return toy_data([3, 5], seed=first), np.array([True, False])
 
-    keep = keeping(tmp_path / "waves", kinds=1, mend="begin anew")(wave)
+    keep = keeping(tmp_path / "waves", kinds=1, hint="begin anew")(wave)
     one, won = keep(0)
     with pytest.raises(KeyboardInterrupt):
         keep(50)

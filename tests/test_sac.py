@@ -197,7 +197,7 @@ def test_rewards(kind, roadmap):
 
 
 def test_an_alive_bonus_is_all_that_a_fall_costs():
-    """And being faster than asked for earns no more, while effort has its price."""
+    """And being faster than asked for earns no more, while action_scale has its price."""
     config = replace(TINY, alive_bonus=2.0, speed_mps=1.0, action_cost=0.5, arrival_bonus=0.0)
     sac = make(config)
     state = sac.create(
@@ -404,15 +404,15 @@ def test_a_fall_costs_more_and_more():
 
 
 def test_effort_limits_what_the_controller_asks_for():
-    full, gentle = (blank_controller(POINT, "world", effort=effort) for effort in (1.0, 0.25))
+    full, gentle = (blank_controller(POINT, "world", action_scale=action_scale) for action_scale in (1.0, 0.25))
     proprio, goal = jnp.ones((5, 2)), 10 * jnp.ones((5, 2))
     np.testing.assert_allclose(0.25 * full(proprio, goal), gentle(proprio, goal), rtol=1e-6)
 
 
-def blank_controller(robot, frame: str, effort: float = 1.0) -> SacController:
+def blank_controller(robot, frame: str, action_scale: float = 1.0) -> SacController:
     """An untrained controller."""
     env = MazeEnv(robot, engine="mujoco", maps=False)
     size = input_size(env.proprio_size, frame)
     policy = controller_networks(size, env.action_size, (16,)).policy_network.init(jax.random.key(3))
     normalizer = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
-    return SacController(normalizer, policy, env.action_size, (16,), frame, effort)
+    return SacController(normalizer, policy, env.action_size, (16,), frame, action_scale)

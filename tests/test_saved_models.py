@@ -28,7 +28,7 @@ from ct_jax.model import (
     save_model,
     zoo_names,
 )
-from ct_jax.presets import Settings, from_dict, to_dict
+from ct_jax.settings import Settings, from_dict, to_dict
 from ct_jax.transformer import ModelConfig
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
@@ -128,7 +128,7 @@ def test_settings_are_refused_or_sound(values):
     assert from_dict(json.loads(json.dumps(to_dict(found[0])))) == found[0]
     model = found[0].model
     assert min(model.layers, model.heads, model.context_acting, model.modes, model.stride) >= 1 < model.width + 1
-    assert model.width % model.heads == 0 and model.map_cell_m > 0 and found[0].optimism > 0
+    assert model.width % model.heads == 0 and model.map_cell_m > 0 and found[0].return_scale > 0
     assert all(type(size) is int and size > 0 for size in found[0].sac.hidden)
 
 
@@ -180,7 +180,10 @@ def assert_same_model(found, model):
 
 
 @pytest.fixture(scope="module")
-def model_json(folder):
+def model_json(trained, tmp_path_factory):
+    """As it was written: tests change the one in ``folder``."""
+    folder = tmp_path_factory.mktemp("unchanged")
+    save_model(folder, trained)
     return json.loads((folder / "model.json").read_text())
 
 
@@ -245,11 +248,11 @@ def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
     assert_same_model(load_model(str(folder)), trained)
 
 
-@pytest.mark.parametrize("number", [0, 3, 99, None, "2", 2.0, True])
+@pytest.mark.parametrize("number", [0, 4, 99, None, "2", 2.0, True])
 def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json, number):
     save_model(folder, trained)
     (folder / "model.json").write_text(json.dumps(model_json | {"format": number}))
-    with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 and 2"):
+    with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 to 3"):
         load_model(str(folder))
 
 
@@ -259,7 +262,7 @@ def test_shipped_weights_are_bound_to_their_description(name, tmp_path):
     for file in place.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     described = json.loads((tmp_path / "model.json").read_text())
-    described["settings"]["optimism"] *= 0.5
+    described["settings"]["model"]["max_timestep"] *= 2
     (tmp_path / "model.json").write_text(json.dumps(described))
     with pytest.raises(UserError, match="weights of another model"):
         load_model(str(tmp_path))

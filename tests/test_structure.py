@@ -16,7 +16,7 @@ ORDER = [
     *["drive", "explorer_turtlebot3", "collect_turtlebot3"],
     *["dense", "transformer", "value", "fit", "policy", "agent", "evaluate", "finetune"],
     *["evaluate_turtlebot3", "finetune_turtlebot3"],
-    *["baselines", "transfer", "presets", "model", "run"],
+    *["baselines", "transfer", "settings", "presets", "model", "run"],
     *["report", "mazes", "rooms", "pipeline", "cli"],
 ]
 USERS = {"experiments", "benchmarks", "tests"}  # of the packages: no package knows of them

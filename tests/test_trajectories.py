@@ -80,26 +80,26 @@ def test_maps_are_what_the_robot_saw_there(toy_data):
     i, t = which_step(window, data)
     assert set(data.maze[i.ravel()]) == set(data.maze)
     mazes = jax.tree.map(lambda leaf: leaf[data.maze[i.ravel()]], MAZES)
-    positions, goals = data.position[i, t].reshape(-1, 2), data.goal[i.ravel()]
+    positions, goals = data.position[i, t].reshape(-1, 2), data.goal_world[i.ravel()]
     expected = jax.vmap(lambda m, p, g: local_map(m, p, g, cell_m=CELL))(mazes, positions, goals)
     np.testing.assert_array_equal(window.map.reshape(expected.shape), expected)
-    np.testing.assert_array_equal(window.goal.reshape(-1, 2), goals - positions)
+    np.testing.assert_array_equal(window.goal_relative.reshape(-1, 2), goals - positions)
 
 
 @pytest.mark.parametrize("stride", [1, 3])
 def test_a_window_is_a_piece_of_a_trajectory(toy_data, stride):
     data = toy_data(LENGTHS)
-    data = data.replace(learn=(np.random.default_rng(0).random(data.learn.shape) < 0.5).astype(np.float32))
+    data = data.replace(label_mask=(np.random.default_rng(0).random(data.label_mask.shape) < 0.5).astype(np.float32))
     window = windows(data, steps=5, stride=stride)
     i, t = which_step(window, data)
     inside = np.asarray(window.timestep) < data.length[i]
     np.testing.assert_array_equal(window.valid, inside)
     np.testing.assert_array_equal(np.diff(t, axis=1)[inside[:, 1:]], stride)
     np.testing.assert_array_equal(window.timestep[inside], (t[:, :1] + stride * np.arange(5))[inside])
-    for name in ("action", "target", "learn"):
+    for name in ("action", "label", "label_mask"):
         np.testing.assert_array_equal(getattr(window, name)[inside], getattr(data, name)[i, t][inside], err_msg=name)
     np.testing.assert_array_equal(np.asarray(window.rtg)[inside], np.asarray(data.rtg)[i, t][inside])
-    assert not np.asarray(window.learn)[~inside].any()
+    assert not np.asarray(window.label_mask)[~inside].any()
     assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones are cut
 
 
@@ -154,7 +154,7 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
 def test_the_eight_symmetries_are_a_group(toy_data):
     one = jax.tree.map(lambda leaf: leaf[:1], windows(toy_data([30], seed=3)))
     images = [mirror_windows(jnp.array([s]), GROUP, one) for s in range(8)]
-    names = ("map", "proprio", "goal", "action", "target")
+    names = ("map", "proprio", "goal_relative", "action", "label")
 
     def index(window) -> int:
         """Which image a window is; there must be one."""
@@ -180,8 +180,8 @@ def turn_world(symmetry: int, mazes, data: Trajectories):
     """The same episodes in a mirrored world, from nothing but what each bit is said to mean."""
     side = mazes.shape[0] * 4.0
     walls, centre = np.asarray(mazes.walls), np.float32(side / 2)
-    points = {"position": np.asarray(data.position) - centre, "goal": np.asarray(data.goal) - centre}
-    vectors = points | {name: np.asarray(getattr(data, name)) for name in ("proprio", "action", "target")}
+    points = {"position": np.asarray(data.position) - centre, "goal_world": np.asarray(data.goal_world) - centre}
+    vectors = points | {name: np.asarray(getattr(data, name)) for name in ("proprio", "action", "label")}
     if symmetry & 1:
         walls, vectors = walls.swapaxes(1, 2), {name: v[..., ::-1] for name, v in vectors.items()}
     if symmetry & 2:
@@ -199,7 +199,7 @@ def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry)
     mazes = stack_mazes([make_maze(random_walls(seed, height=12, width=12, density=0.7)) for seed in range(3)])
     data = toy_data([20, 9], mazes=3, side_m=48.0, seed=symmetry)
     data = data.replace(
-        position=np.round(data.position * 64) / 64 + 1 / 128, goal=np.round(data.goal * 64) / 64 + 1 / 128
+        position=np.round(data.position * 64) / 64 + 1 / 128, goal_world=np.round(data.goal_world * 64) / 64 + 1 / 128
     )
     turned_mazes, turned = turn_world(symmetry, mazes, data)
     options = {"batch": 16, "steps": 4, "map_cell_m": 0.75}
@@ -242,7 +242,7 @@ def test_a_damaged_file_is_named(toy_data, tmp_path, damage):
         case "other arrays":
             np.savez(file, position=np.zeros(3))
         case "pickle":
-            np.savez(file, **fields(toy_data(LENGTHS)) | {"goal": np.array([{"a": 1}], dtype=object)})
+            np.savez(file, **fields(toy_data(LENGTHS)) | {"goal_world": np.array([{"a": 1}], dtype=object)})
         case _:
             content = {"empty": b"", "text": b"no arrays", "half": whole[: len(whole) // 2]}
             broken = whole[:middle] + bytes([whole[middle] ^ 0xFF]) + whole[middle + 1 :]
@@ -279,7 +279,7 @@ def test_arrays_that_are_no_trajectories_are_named(toy_data, tmp_path_factory, d
     good = toy_data(LENGTHS)
     if data.draw(st.booleans()):
         maps = np.zeros((*good.reward.shape, 2, 25, 25), np.uint8)
-        good = good.replace(seen=good.proprio, map_bits=pack_maps(maps))
+        good = good.replace(goal_relative=good.proprio, map_bits=pack_maps(maps))
     file = tmp_path_factory.getbasetemp() / "bad.npz"
     np.savez(file, **damaged(fields(good), data.draw))
     with pytest.raises(UserError, match=r"bad\.npz: not a trajectory file \(.*\); collect again"):
@@ -321,7 +321,7 @@ def test_joining_keeps_everything(toy_data, steps):
     for k, (part, i) in enumerate(single):
         length = part.length[i]
         for name, leaf in fields(part).items():
-            per_step = name not in ("goal", "maze", "length")
+            per_step = name not in ("goal_world", "maze", "length")
             one, joined = leaf[i], np.asarray(getattr(whole, name))[k]
             np.testing.assert_array_equal(joined[:length] if per_step else joined, one[:length] if per_step else one)
     assert whole.position.shape[1] < max(steps) + 64
@@ -362,7 +362,7 @@ def kept(toy_data):
     def make(lengths):
         data = toy_data(lengths)
         maps = np.random.default_rng(1).integers(0, 2, (*data.reward.shape, 2, 25, 25), dtype=np.uint8)
-        return data.replace(seen=data.proprio + np.float32(0.5), map_bits=pack_maps(maps)), maps
+        return data.replace(goal_relative=data.proprio + np.float32(0.5), map_bits=pack_maps(maps)), maps
 
     return make
 
@@ -379,7 +379,7 @@ def test_kept_maps_and_goals_come_back_and_need_no_maze(kept):
     window = draw(jax.random.key(0), data, data.rtg, None, batch=64, steps=5, map_cell_m=CELL)
     i, t = which_step(window, data)
     np.testing.assert_array_equal(window.map, maps[i, t])
-    np.testing.assert_array_equal(window.goal, np.stack([i, t], -1) + np.float32(0.5))
+    np.testing.assert_array_equal(window.goal_relative, np.stack([i, t], -1) + np.float32(0.5))
 
 
 def test_kept_maps_survive_saving_padding_and_joining(kept, tmp_path):
@@ -399,6 +399,6 @@ def test_the_turtlebot_mirrored_sees_left_and_right_change_places(kept):
     window = draw(jax.random.key(0), data, data.rtg, None, batch=8, steps=5, map_cell_m=CELL)
     mirrored = mirror_windows(jnp.ones(8, jnp.int32), group, window)
     np.testing.assert_array_equal(mirrored.map, window.map[..., ::-1, :])
-    for name in ("proprio", "goal", "action", "target"):
+    for name in ("proprio", "goal_relative", "action", "label"):
         np.testing.assert_array_equal(getattr(mirrored, name), np.asarray(getattr(window, name)) * np.float32([1, -1]))
     assert_same(mirror_windows(jnp.ones(8, jnp.int32), group, mirrored), window)

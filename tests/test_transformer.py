@@ -202,11 +202,11 @@ def propose(model, params, inputs) -> Modes:
 
 def skilled(**changes):
     """A model whose head is a controller, its parameters, and the controller."""
-    sac = SacConfig(hidden=(8, 8), effort=0.5)
+    sac = SacConfig(hidden=(8, 8), action_scale=0.5)
     normalizer = running_statistics.init_state(specs.Array((P + 2,), jnp.dtype("float32")))
     normalizer = normalizer.replace(mean=jnp.arange(P + 2.0) / 5, std=1.0 + jnp.arange(P + 2.0))
     policy = controller_networks(P + 2, A, sac.hidden).policy_network.init(jax.random.key(3))
-    controller = SacController(normalizer, policy, A, sac.hidden, sac.frame, sac.effort)
+    controller = SacController(normalizer, policy, A, sac.hidden, sac.frame, sac.action_scale)
     model = ControlTransformer(replace(TINY, skill=True, **changes), A, sac)
     params = jax.jit(model.init)(jax.random.key(0), *sample_inputs(P, A))
     return model, with_skill(params, controller), controller
@@ -227,7 +227,7 @@ def test_a_skill_is_the_controller_sent_where_the_trunk_says(modes):
         flat = piece["proprio"].reshape(-1, P)
         meant = controller(flat, jnp.broadcast_to(where[i], (len(flat), 2)))
         np.testing.assert_allclose(found[:, :, i].reshape(-1, A), meant, atol=1e-5)
-    assert np.abs(found).max() <= 0.5  # its effort
+    assert np.abs(found).max() <= 0.5  # its action_scale
 
 
 @pytest.mark.rank_promotion("allow")

@@ -698,12 +698,12 @@ def test_drives_are_told_as_they_were(drives):
         assert each.success and away[-1] < 0.2 and (away[:-1] >= 0.2).all() and each.length > 10
         np.testing.assert_allclose(each.reward, -away - each.collision, atol=1e-3)
         turn = np.exp(-1j * each.yaw_rad) * ((each.goal_world - each.position) @ [1, 1j])
-        np.testing.assert_allclose(each.goal @ [1, 1j], turn, atol=1e-3)
+        np.testing.assert_allclose(each.goal_relative @ [1, 1j], turn, atol=1e-3)
         np.testing.assert_allclose(each.proprio @ [1, 1j], turn / np.abs(turn), atol=1e-3)
-        held = np.abs(each.goal).max(-1) < 0.99
+        held = np.abs(each.goal_relative).max(-1) < 0.99
         np.testing.assert_array_equal(np.asarray(unpack_maps(each.map_bits))[held, 1].sum((1, 2)), 1)
-        np.testing.assert_array_equal(each.action, each.target)
-        assert each.map_bits.shape == (each.length, 157) and (each.learn == 1).all()
+        np.testing.assert_array_equal(each.action, each.label)
+        assert each.map_bits.shape == (each.length, 157) and (each.label_mask == 1).all()
 
 
 @bullet
@@ -712,10 +712,10 @@ def test_trajectories_are_the_drives(drives):
     assert data.n == 3
     np.testing.assert_array_equal(data.length, [each.length for each in drives])
     for i, each in enumerate(drives):
-        for name, kept in (("seen", each.goal), ("map_bits", each.map_bits), ("reward", each.reward)):
+        for name, kept in (("goal_relative", each.goal_relative), ("map_bits", each.map_bits), ("reward", each.reward)):
             np.testing.assert_array_equal(getattr(data, name)[i, : each.length], kept)
             assert not getattr(data, name)[i, each.length :].any()
-        np.testing.assert_array_equal(data.goal[i], each.goal_world)
+        np.testing.assert_array_equal(data.goal_world[i], each.goal_world)
 
 
 @bullet
@@ -733,7 +733,7 @@ def test_other_guides_arrive_too_and_a_disturbance_is_not_imitated(guide, noise,
     drives = drive_guided(pool, wave, make_guide(guide, PRM), noise=noise)
     assert all(each.success for each in drives)
     for each in drives:
-        np.testing.assert_array_equal(each.action, each.target)
+        np.testing.assert_array_equal(each.action, each.label)
     driven = np.linalg.norm(np.diff(drives[0].position, axis=0), axis=-1) / (0.22 * DT_S)
     assert np.abs(driven - drives[0].action[:-1, 0]).max() > 0.4 * noise
 

@@ -8,7 +8,7 @@ import optax
 from ct_envs.occupancy import MAP_CELLS
 from ct_jax.fit import value_loss
 from ct_jax.trajectories import Window
-from ct_jax.transformer import RETURN_SCALE
+from ct_jax.transformer import RETURN_DIVISOR
 from ct_jax.value import ValueNetwork
 
 MODEL = ValueNetwork(16)
@@ -50,7 +50,7 @@ def test_the_loss_is_the_squared_error_of_the_undiscounted_return():
     rtg = -100.0 * jnp.arange(1.0, 9.0)[:, None]
     valid = (jnp.arange(8) < 6).astype(jnp.float32)[:, None]
     value = apply(PARAMS, *inputs)
-    expected = np.mean(((value - rtg) / RETURN_SCALE)[:6] ** 2)
+    expected = np.mean(((value - rtg) / RETURN_DIVISOR)[:6] ** 2)
     loss = jax.jit(value_loss(MODEL))
     key = jax.random.key(0)
     np.testing.assert_allclose(loss(PARAMS, window(*inputs, rtg, valid), key), expected, rtol=1e-5)

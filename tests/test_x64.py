@@ -94,16 +94,17 @@ def test_guides(both, push, method):
 CONFIG = ModelConfig(layers=1, heads=2, width=8, context=3, context_acting=3, max_timestep=8, modes=2, stride=2)
 
 
-def transformer(reprompt: bool = False) -> TransformerPolicy:
+def transformer(clip_target_return: bool = False) -> TransformerPolicy:
     inputs = sample_inputs(2, 2)
     return TransformerPolicy(
         jax.jit(ControlTransformer(CONFIG, 2).init)(jax.random.key(0), *inputs),
-        jax.jit(ValueNetwork(4).init)(jax.random.key(0), *inputs[:3]), CONFIG, 2, value_width=4, reprompt=reprompt,
+        jax.jit(ValueNetwork(4).init)(jax.random.key(0), *inputs[:3]), CONFIG, 2, value_width=4,
+        clip_target_return=clip_target_return,
     )  # fmt: skip
 
 
 def test_the_transformer_acts(both):
-    policy = jax.device_get(transformer(reprompt=True))  # as a shipped model's: drawn without 64 bits
+    policy = jax.device_get(transformer(clip_target_return=True))  # as a shipped model's: drawn without 64 bits
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), "ct", policy=policy)), atol=1e-2)
 
 
@@ -153,6 +154,6 @@ def test_collection_and_recoveries(both, push):
     def gather():
         collected = collect(jax.random.key(0), env, mazes, push(), config, PRM)
         recovered = recover(jax.random.key(0), seeing, mazes, policy, push(), recovering, config, PRM)
-        return [(data.length, data.goal, data.position[:, 0]) for data in (collected, recovered)]
+        return [(data.length, data.goal_world, data.position[:, 0]) for data in (collected, recovered)]
 
     assert_alike(*both(gather), atol=1e-2)

@@ -95,7 +95,7 @@ def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
 
     The reward of the last step shows whether it arrived or was cut off.
     """
-    see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal[:, i])  # noqa: E731
+    see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal_relative[:, i])  # noqa: E731
     reward, last = window.reward[:, 0], 1.0 - window.valid[:, 1]
     arrived = last * at_goal(reward, goal_tolerance_m)
     known = window.valid[:, 0] * (1.0 - last + arrived)

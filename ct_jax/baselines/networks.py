@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, UInt8
 
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.rollout import Action, act_as_meant
+from ct_jax.rollout import Action, act_as_intended
 from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_features, directions, goal_features
 
 
@@ -103,4 +103,4 @@ class ActorPolicy:
         obs: dict = state.obs  # pyright: ignore
         actor = Actor(self.action_size, self.width, self.frame)
         logits: Any = actor.apply(self.params, Seen(obs["map"], obs["proprio"], obs["goal"]))
-        return act_as_meant(tanh_gaussian(self.action_size).mode(logits)), memory
+        return act_as_intended(tanh_gaussian(self.action_size).mode(logits)), memory

@@ -34,8 +34,8 @@ class SacAlone(Sac):
     def __init__(self, env: MazeEnv, config: SacConfig):
         set_to = {name: value for name, value in EDGES_ONLY.items() if getattr(config, name) != value}
         if set_to:
-            mend = ", ".join(f"{name}={value}" for name, value in set_to.items())
-            raise UserError(f"SAC alone has no edges, so some settings of SacConfig do not apply; set {mend}")
+            hint = ", ".join(f"{name}={value}" for name, value in set_to.items())
+            raise UserError(f"SAC alone has no edges, so some settings of SacConfig do not apply; set {hint}")
         super().__init__(env, config)
         self.reward = "distance"
 

@@ -30,7 +30,7 @@ from ct_envs.maze import Maze
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
-from ct_jax.rollout import Action, Controller, act_as_meant, broke_off, rollout
+from ct_jax.rollout import Action, Controller, act_as_intended, broke_off, rollout
 
 Metres = Annotated[float, Within(0, 1_000_000)]  # also for other terms of the reward
 
@@ -61,7 +61,7 @@ class SacConfig(Checked):
     # no more than this one
     action_cost: Metres = 0.0  # cost of a step with all actuators at their limits
     tilt_m: Metres = 0.0  # a torso on its side costs as much as being this much farther away [m]
-    effort: Annotated[float, Above(0, 1)] = 1.0  # share of the actuators' range that the controller uses
+    action_scale: Annotated[float, Above(0, 1)] = 1.0  # share of the actuators' range that the controller uses
     greedy: Share = 0.0  # share of the environments with deterministic actions, as in later use: they visit states in
     # which only random actions would make progress
     target_rate: Annotated[float, Above(0, 1)] = 0.005  # share of the new critic in the target critic at each update
@@ -150,13 +150,13 @@ class SacController:
     action_size: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
     frame: str = struct.field(pytree_node=False, default="world")
-    effort: float = struct.field(pytree_node=False, default=1.0)
+    action_scale: float = struct.field(pytree_node=False, default=1.0)
 
     def __call__(self, proprio: Float[Array, "N P"], goal: Float[Array, "N 2"]) -> Float[Array, "N A"]:
         inputs = controller_inputs(jnp.concatenate([proprio, goal], -1), self.frame)
         networks = controller_networks(inputs.shape[-1], self.action_size, self.hidden)
         logits = networks.policy_network.apply(self.normalizer, self.policy, inputs)
-        return self.effort * networks.parametric_action_distribution.mode(logits)
+        return self.action_scale * networks.parametric_action_distribution.mode(logits)
 
 
 def blank_statistics(size: int) -> running_statistics.RunningStatisticsState:
@@ -175,7 +175,7 @@ def blank_controller(key: jax.Array, proprio_size: int, action_size: int, config
         action_size=action_size,
         hidden=config.hidden,
         frame=config.frame,
-        effort=config.effort,
+        action_scale=config.action_scale,
     )
 
 
@@ -357,7 +357,7 @@ class Sac:
             action = jnp.where(without[:, None], distribution.mode(logits), action)
         random = jax.random.uniform(random_key, action.shape, jnp.float32, minval=-1.0, maxval=1.0)
         action = jnp.where(state.iteration < self.config.warmup, random, action)
-        after = jax.vmap(self.env.step)(state.env, self.config.effort * action)
+        after = jax.vmap(self.env.step)(state.env, self.config.action_scale * action)
         reward = self._reward(state.env, action, after)
         over = after.done
         truncation = after.info["truncation"]
@@ -525,7 +525,7 @@ class Steered:
 
     def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
         action = self.controller(state.obs["proprio"], state.obs["goal"])  # pyright: ignore
-        return act_as_meant(action), memory
+        return act_as_intended(action), memory
 
 
 def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
@@ -592,7 +592,7 @@ def train_controller(
 
     def learned(state: SacState) -> SacController:
         normalizer, average = jax.tree.map(jnp.asarray, jax.device_get((state.normalizer, state.average)))
-        return SacController(normalizer, average, env.action_size, config.hidden, config.frame, config.effort)
+        return SacController(normalizer, average, env.action_size, config.hidden, config.frame, config.action_scale)
 
     def train(state: SacState, n: int) -> tuple[SacState, dict[str, Any]]:
         after, metrics = sac.train(state, n)

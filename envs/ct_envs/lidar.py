@@ -44,10 +44,10 @@ def lidar_map(
         found = ranges.shape[-1] if ranges.ndim else "no list of"
         raise UserError(f"the lidar gave {found} ranges, not {beams}; give one for each beam, all around")
     missing = ~np.isfinite(ranges) | (ranges == 0)
-    for wrong, mend in ((ranges < 0, "give metres"), (missing & (not missing_ok), "or allow it: missing_ok=True")):
+    for wrong, hint in ((ranges < 0, "give metres"), (missing & (not missing_ok), "or allow it: missing_ok=True")):
         if wrong.any():
             beam = int(np.argwhere(wrong)[0][-1])
-            raise UserError(f"the lidar's range {ranges[wrong][0]} m of beam {beam} is not a distance; {mend}")
+            raise UserError(f"the lidar's range {ranges[wrong][0]} m of beam {beam} is not a distance; {hint}")
     met = ~missing & (ranges < range_m)
     angle = np.asarray(yaw_rad)[..., None] + np.arange(beams) * (2 * np.pi / beams)
     ends = np.where(met, ranges, 0.0)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)

@@ -136,7 +136,7 @@ def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
     """Load a named layout, or a maze file as ``parse_walls`` reads it.
 
     Raises:
-        UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the mend).
+        UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the hint).
     """
     return make_maze(load_walls(name_or_file), cell_m=cell_m)
 
@@ -188,8 +188,8 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
             if char not in known:
                 raise UserError(f"{source}:{number}: column {column} is {char!r}; use {marks}")
         if len(row) != len(top):
-            mend = f"line {first} has {len(top)}; make all lines equal"
-            raise UserError(f"{source}:{number}: {len(row)} cells, but {mend}")
+            hint = f"line {first} has {len(top)}; make all lines equal"
+            raise UserError(f"{source}:{number}: {len(row)} cells, but {hint}")
     walls = np.array([[char == marks.wall for char in row] for _, row in rows])
     _check_closed(walls, marks, source, lambda row, column: f"{source}:{rows[row][0]}: column {column + 1}")
     return walls[::-1]
@@ -210,13 +210,13 @@ def _is_comment(line: str) -> bool:
 
 def _json(text: str, source: str) -> Any:
     """What JSON text holds. Raises UserError."""
-    mend = 'write a nested list such as [[1, 1, 1], [1, "r", 1], [1, 1, 1]]'
+    hint = 'write a nested list such as [[1, 1, 1], [1, "r", 1], [1, 1, 1]]'
     try:
         return json.loads(text)
     except json.JSONDecodeError as bad:
-        raise UserError(f"{source}:{bad.lineno}: not JSON ({bad.msg}); {mend}") from None
+        raise UserError(f"{source}:{bad.lineno}: not JSON ({bad.msg}); {hint}") from None
     except (ValueError, RecursionError):  # a number of thousands of digits, thousands of brackets
-        raise UserError(f"{source}: not the JSON of a maze; {mend}") from None
+        raise UserError(f"{source}: not the JSON of a maze; {hint}") from None
 
 
 def _listed(rows: list | tuple, source: str) -> np.ndarray:
@@ -230,8 +230,8 @@ def _listed(rows: list | tuple, source: str) -> np.ndarray:
             if not _is_listed(cell):
                 raise UserError(f"{source}: row {number}, column {column} is {_brief(cell)}; use {LISTED}")
         if len(row) != len(rows[0]):
-            mend = f"row 1 has {len(rows[0])}; make all rows equal"
-            raise UserError(f"{source}: row {number} has {len(row)} cells, but {mend}")
+            hint = f"row 1 has {len(rows[0])}; make all rows equal"
+            raise UserError(f"{source}: row {number} has {len(row)} cells, but {hint}")
     walls = np.array([[cell == 1 for cell in row] for row in rows], bool)
     _check_closed(walls, LISTED, source, lambda row, column: f"{source}: row {row + 1}, column {column + 1}")
     return walls[::-1]
