@@ -24,11 +24,12 @@ from _harness import Contestant, Options, Results, command_line, has_peer
 from mujoco import mjx
 from mujoco.batch import Batch
 
-from ct_envs import MazeEnv, load_maze, stack_mazes
+from ct_envs import MazeEnv, load_maze
 from ct_jax.collect import collect
 from ct_jax.model import load_controller
 from ct_jax.presets import get_preset
 from ct_jax.run import cores
+from ct_jax.worlds.mazes import MazeWorld
 
 MAZE = "antmaze-large"
 MIDDLE = 256  # environments at which all observations are compared, and peers
@@ -261,13 +262,13 @@ def collection(robot: str, options: RolloutOptions, results: Results) -> None:
     settings = get_preset("cpu", robot)
     controller, _ = load_controller("zoo", robot)
     env = MazeEnv(robot, maps=False, auto_reset=False, horizon=settings.collect.horizon)
-    mazes = stack_mazes([load_maze(MAZE)])
+    world = MazeWorld(env, load_maze(MAZE))
     for guide in ("roadmap", "shortcut", "explorer"):
         size = max(1, round(1.25 * options.trajectories))
         config = replace(settings.collect, trajectories=options.trajectories, envs=size, guide=guide)
 
         def run(config=config) -> object:
-            return jnp.asarray(collect(jax.random.key(0), env, mazes, controller, config, settings.prm).length)
+            return jnp.asarray(collect(jax.random.key(0), world, controller, config, settings.prm).length)
 
         name = f"{robot}, collection guided by {guide}"
         results.race(name, "trajectories/s", Contestant(run, options.trajectories))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ct_jax.collect import CollectConfig
     from ct_jax.collect import collect as collect_trajectories
     from ct_jax.controllers.sac import SacConfig
-    from ct_jax.evaluate import Episodes, draw_pairs
+    from ct_jax.evaluate import Episodes
     from ct_jax.evaluate import evaluate as evaluate_pairs
     from ct_jax.finetune import RecoverConfig, recover
     from ct_jax.fit import FitConfig, ValueConfig
@@ -22,18 +22,20 @@ if TYPE_CHECKING:
     from ct_jax.policy import TransformerPolicy
     from ct_jax.presets import get_preset
     from ct_jax.prm import PrmConfig
-    from ct_jax.rollout import Controller, Guide, Policy
     from ct_jax.run import Run
     from ct_jax.settings import Settings
     from ct_jax.trajectories import Trajectories
     from ct_jax.transformer import ControlTransformer, ModelConfig
+    from ct_jax.types import Action, Controller, Frame, Guide, Observation, Policy, World
+    from ct_jax.worlds.mazes import MazeWorld
+    from ct_jax.worlds.rooms import RoomWorld
 
 __version__ = "0.1.0"
 __all__ = [
-    "Agent", "CollectConfig", "ControlTransformer", "Controller", "Episodes", "FitConfig", "Guide", "ModelConfig",
-    "Policy", "PrmConfig", "RecoverConfig", "Run", "SacConfig", "Settings", "Trajectories", "TransformerPolicy",
-    "UserError", "ValueConfig", "collect_trajectories", "draw_pairs", "evaluate_model", "evaluate_pairs", "get_preset",
-    "load", "recover", "train",
+    "Action", "Agent", "CollectConfig", "ControlTransformer", "Controller", "Episodes", "FitConfig", "Frame", "Guide",
+    "MazeWorld", "ModelConfig", "Observation", "Policy", "PrmConfig", "RecoverConfig", "RoomWorld", "Run", "SacConfig",
+    "Settings", "Trajectories", "TransformerPolicy", "UserError", "ValueConfig", "World", "collect_trajectories",
+    "evaluate_model", "evaluate_pairs", "get_preset", "load", "recover", "train",
 ]  # fmt: skip
 
 _NAMES = {
@@ -41,7 +43,7 @@ _NAMES = {
     "ct_jax.agent": ("Agent",),
     "ct_jax.collect": ("CollectConfig",),
     "ct_jax.controllers.sac": ("SacConfig",),
-    "ct_jax.evaluate": ("Episodes", "draw_pairs"),
+    "ct_jax.evaluate": ("Episodes",),
     "ct_jax.finetune": ("RecoverConfig", "recover"),
     "ct_jax.fit": ("FitConfig", "ValueConfig"),
     "ct_jax.pipeline": ("evaluate_model", "train"),
@@ -49,10 +51,12 @@ _NAMES = {
     "ct_jax.presets": ("get_preset",),
     "ct_jax.settings": ("Settings",),
     "ct_jax.prm": ("PrmConfig",),
-    "ct_jax.rollout": ("Controller", "Guide", "Policy"),
     "ct_jax.run": ("Run",),
     "ct_jax.trajectories": ("Trajectories",),
     "ct_jax.transformer": ("ControlTransformer", "ModelConfig"),
+    "ct_jax.types": ("Action", "Controller", "Frame", "Guide", "Observation", "Policy", "World"),
+    "ct_jax.worlds.mazes": ("MazeWorld",),
+    "ct_jax.worlds.rooms": ("RoomWorld",),
 }
 _SOURCE = {name: (module, name) for module, names in _NAMES.items() for name in names} | {
     "collect_trajectories": ("ct_jax.collect", "collect"),  # whose own names are those of submodules

@@ -7,21 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ct_envs import UserError
 from ct_envs.checked import shown
 from ct_envs.occupancy import MAP_CELLS
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
-from ct_jax.rollout import Action, Policy
-
-
-@jax.jit
-def act(policy: Policy, memory: Any, state: State, key: jax.Array) -> tuple[Action, Any]:
-    """``policy.act``, compiled."""
-    return policy.act(memory, state, key)
+from ct_jax.types import AnyArray, Frame, Observation, Privileged
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +38,10 @@ class Agent:
         Raises:
             UserError: an entry is missing, or is of a wrong shape or type, or is not finite.
         """
-        return self.policy.init(self._state(observation))
+        return self.policy.init(self._frame(observation))
 
     @with_own_numerics
-    def act(self, memory: Any, observation: Mapping[str, Any], reward: Any) -> tuple[Float[Array, "N A"], Any]:
+    def act(self, memory: Any, observation: Mapping[str, Any], reward: Any) -> tuple[Float[AnyArray, "N A"], Any]:
         """The next actions, in [-1, 1], and the memory after them.
 
         Args:
@@ -58,13 +51,13 @@ class Agent:
         Raises:
             UserError: as ``init``; or the memory is of another model or batch size.
         """
-        state = self._state(observation, reward)
-        self._check_memory(memory, state)
-        action, memory = act(self.policy, memory, state, jax.random.key(0))
+        frame = self._frame(observation, reward)
+        self._check_memory(memory, frame)
+        action, memory = self.policy.act(memory, frame, jax.random.key(0))
         return action.executed, memory
 
-    def _state(self, observation: Mapping[str, Any], reward: Any = None) -> State:
-        """What a policy needs of a brax state. Raises UserError."""
+    def _frame(self, observation: Mapping[str, Any], reward: Any = None) -> Frame:
+        """What a policy may see. Raises UserError."""
         shapes = {"map": (2, MAP_CELLS, MAP_CELLS), "proprio": (self.proprio_size,), "goal": (2,)}
         if not isinstance(observation, Mapping):
             raise UserError(f"the observation is a {type(observation).__name__}; give a dict of {', '.join(shapes)}")
@@ -78,7 +71,9 @@ class Agent:
             if len(array) != n:
                 raise UserError(f"'{name}' is of {len(array)} episodes, 'map' of {n}; give as many of each")
         reward = arrays.pop("reward")
-        return State(None, arrays, reward, np.zeros(n, np.float32), {}, {})
+        seen = Observation(arrays["map"], arrays["proprio"], arrays["goal"])
+        nothing = Privileged(None, None, None, None)  # pyright: ignore[reportArgumentType]
+        return Frame(seen, reward, np.zeros(n, bool), nothing)  # pyright: ignore[reportArgumentType]
 
     def _array(self, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
         """The checked entry [N, *shape] as the policy takes it. Raises UserError."""
@@ -106,11 +101,11 @@ class Agent:
             raise UserError(f"'{name}' is not finite in row {int(np.argmin(finite))}; give numbers that are")
         return array
 
-    def _check_memory(self, memory: Any, state: State) -> None:
+    def _check_memory(self, memory: Any, frame: Frame) -> None:
         """Raise UserError for a memory that is not of this policy, or of another number of episodes."""
-        n = len(state.done)
+        n = len(frame.done)
         if n not in self._memories:
-            self._memories[n] = jax.eval_shape(self.policy.init, state)
+            self._memories[n] = jax.eval_shape(self.policy.init, frame)
         wanted = self._memories[n]
         alike = jax.tree.structure(memory) == jax.tree.structure(wanted)
         if not alike or [np.shape(x) for x in jax.tree.leaves(memory)] != [x.shape for x in jax.tree.leaves(wanted)]:

@@ -1,43 +1,24 @@
 """Evaluation on fixed start-goal pairs: success, return, SPL, collisions and time-outs, with intervals."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from scipy import stats
 
-from ct_envs import MazeEnv, Tasks, UserError, check_tasks
-from ct_envs.maze import Maze, sample_pair
-from ct_envs.robots import Robot
-from ct_jax.collect import make_guide, plan_memory, run_episodes, start_episodes
-from ct_jax.devices import data_mesh, fill_up, joined, own
+from ct_envs import UserError
+from ct_jax.devices import joined
+from ct_jax.guided import Guided
 from ct_jax.numerics import with_own_numerics
-from ct_jax.policy import Conditioned
-from ct_jax.prm import PlanTable, PrmConfig, Space, build_roadmap, extend_by_pairs
-from ct_jax.rollout import Controller, Guided, Policy, Steps, broke_off
+from ct_jax.pairs import Pairs, beyond_horizon
+from ct_jax.prm import PrmConfig
+from ct_jax.types import Controller, OnProgress, Policy, Rollout, World
 
 METHODS = ("ct", "planner", "explorer")
-GUIDED = ("planner", "explorer")  # what is led by a plan; everything else is a policy that was learned
+GUIDED = ("planner", "explorer")  # a planner guides the controller; everything else is a policy that was learned
 MAX_HORIZON = 1_000_000
-_DENSE = PrmConfig(samples=1000)  # of the shortest ways
 RETURN_UNIT = 100.0  # the paper's scaled return is the raw one over this
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Starts and goals of an evaluation, drawn once from a seed, and the shortest ways between them."""
-
-    start: np.ndarray  # [n, 2], [m]
-    goal: np.ndarray
-    shortest_m: np.ndarray  # [n], on a dense roadmap; where it has no path, the straight line
-    seed: int
-    world: np.ndarray | None = None  # int [n]: which of several worlds each is in
-    straight: int = 0  # how many have only a straight line for a shortest way: it is a lower bound
 
 
 @dataclass(frozen=True)
@@ -51,12 +32,12 @@ class Episodes:
     steps: np.ndarray  # [n]
     returns: np.ndarray  # [n], raw; after a fall, or where it diverged, the robot lies where it is until the horizon
     travelled_m: np.ndarray  # [n]
-    path: np.ndarray  # float32 [T, n, 2]: positions, for pictures
+    path: np.ndarray  # float32 [T, n, 2]: positions before each step, for pictures
     pairs: Pairs
     wall_s: float
     horizon: int  # control steps of an episode
-    asked: np.ndarray | None = None  # return asked for at the start
-    film: np.ndarray | None = None  # float32 [T, nq]: ``qpos`` before each step, of the first episode, for a video
+    target_return: np.ndarray | None = None  # return that the policy was conditioned on at the start
+    proprio: np.ndarray | None = None  # float32 [T, P]: of the first episode, for a video
     frontal: np.ndarray | None = None  # bool [n]: ran into something, where that is told from ...
     grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
     not_joined: int | None = None  # of a planner: pairs that its roadmap does not join
@@ -101,142 +82,73 @@ def bootstrap(values: np.ndarray) -> list[float]:
     return [float(result.confidence_interval.low), float(result.confidence_interval.high)]
 
 
-@with_own_numerics
-def draw_pairs(seed: int, maze: Maze, n: int, *, radius_m: float, tolerance_m: float) -> Pairs:
-    """Draw pairs of free points of one region, a goal never within twice the tolerance of its start."""
-    keys = jax.random.split(jax.random.key(seed), 8 * n + 64)
-    draw = jax.jit(jax.vmap(lambda key: sample_pair(key, maze, radius=radius_m)))
-    start, goal = map(np.asarray, draw(keys))
-    apart = np.flatnonzero(np.linalg.norm(start - goal, axis=1) > 2 * tolerance_m)[:n]
-    start, goal = start[apart], goal[apart]
-    shortest, straight = shortest_ways(jax.random.key(seed), maze, start, goal, radius_m=radius_m, config=_DENSE)
-    return Pairs(start, goal, shortest, seed, straight=straight)
-
-
-def shortest_ways(
-    key: jax.Array, space: Maze | Space, start: np.ndarray, goal: np.ndarray, *, radius_m: float, config: PrmConfig
-) -> tuple[np.ndarray, int]:
-    """Lengths [n] (m) of the shortest ways between starts and goals [n, 2] (m) on a roadmap, which grows until it joins
-    them. Where it cannot, the straight line: a lower bound, for a strict SPL. And how many these are."""
-    ends = np.stack([start, goal], 1)
-    grown, nodes = extend_by_pairs(build_roadmap(key, space, radius_m=radius_m, config=config, ends=ends), ends)
-    shortest = grown.distances(nodes)
-    unknown = ~np.isfinite(shortest)
-    return np.where(unknown, np.linalg.norm(start - goal, axis=1), shortest), int(unknown.sum())
-
-
-class Learned(Policy, Protocol):
-    """A policy that can begin an episode by itself: the transformer's, or a baseline's."""
-
-    def init(self, state: State) -> Any:
-        """Its memory at the start of N episodes."""
-        ...
-
-
 def check_horizon(horizon: int | None) -> None:
     """Raises UserError for a horizon that is given and out of its range."""
     if horizon is not None and not 1 <= horizon <= MAX_HORIZON:
         raise UserError(f"--horizon {horizon}: give a number of control steps from 1 to {MAX_HORIZON}")
 
 
-def horizon_for(robot: Robot, pairs: Pairs) -> int:
-    """Control steps of an episode: the robot's own horizon, or more in proportion to the longest way of the pairs."""
-    return int(np.ceil(robot.horizon * max(1.0, float(pairs.shortest_m.max()) / robot.way_m)))
-
-
-def beyond_horizon(robot: Robot, pairs: Pairs, horizon: int) -> int:
-    """How many pairs are farther apart than the robot goes in so many control steps."""
-    return int((pairs.shortest_m > robot.cruise_mps * robot.control_dt_s * horizon).sum())
-
-
 @with_own_numerics
 def evaluate(
-    env: MazeEnv,
-    maze: Maze,
+    world: World,
     pairs: Pairs,
     method: str,
     *,
-    policy: Learned | None = None,
+    policy: Policy | None = None,
     controller: Controller | None = None,
     prm: PrmConfig | None = None,
     horizon: int | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress = lambda over, note: None,
 ) -> Episodes:
-    """Run one method on all pairs at once, which all devices share.
+    """Run one method on all pairs.
 
     Args:
-        env: with maps, without auto-reset.
-        method: "planner" (the full map, needs ``controller``), "explorer" (likewise), or any name for ``policy``.
-        horizon: control steps of an episode; by default the environment's.
+        world: with local maps.
+        pairs: ``world.draw_pairs``, or one's own.
+        method: "planner" (it has the full map and needs ``controller``), "explorer" (it sees local maps, likewise), or
+            any name for ``policy``.
+        prm: the planner's roadmap, and its margins.
+        horizon: control steps of an episode; by default the world's.
 
     Raises:
-        UserError: pairs that are not of that maze.
+        UserError: pairs that are not of that world.
     """
-    check_tasks(Tasks(pairs.start, pairs.goal, len(pairs.start)), maze)  # pyright: ignore[reportArgumentType]
-    env = env.with_horizon(horizon or env.horizon)
-    begun = time.perf_counter()
-    order = fill_up(len(pairs.start), data_mesh())
-    n = len(order)
-    keys = jax.random.split(jax.random.key(pairs.seed), len(pairs.start) + 2)
-    start_keys, plan_key, run_key = keys[:-2][order], keys[-2], keys[-1]
-    mazes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), maze)
-    state = start_episodes(env, start_keys, mazes, jnp.asarray(pairs.start[order]), jnp.asarray(pairs.goal[order]))
-    asked = not_joined = None
-    if method not in GUIDED:
-        assert policy is not None
-        actor, memory = policy, policy.init(state)
-        asked = memory.rtg if isinstance(memory, Conditioned) else None
-    else:
+    begun, horizon = time.perf_counter(), horizon or world.horizon
+    prm = prm or PrmConfig()
+    tasks, not_joined = world.tasks_of(pairs, prm if method == "planner" else None)
+    if method in GUIDED:
         assert controller is not None
-        prm = prm or PrmConfig()
-        guide = make_guide("shortcut" if method == "planner" else method, env, prm)
-        tables, not_joined = _plans(plan_key, env, maze, pairs, prm) if method == "planner" else (None, None)
-        actor = Guided(controller, guide)
-        memory = actor.init(state, plan_memory(guide, tables, jnp.zeros(n, jnp.int32), state))
-    state, _, steps = run_episodes(
-        env, actor, state, memory, run_key, chunk=50, limit=env.horizon, on_progress=on_progress
+        policy = Guided(controller, world.guide("shortcut" if method == "planner" else method, prm))
+    assert policy is not None
+    rollout = world.rollout(policy, tasks, horizon=horizon, on_progress=on_progress)
+    return _outcome(
+        rollout, pairs, time.perf_counter() - begun, not_joined, beyond_horizon(world.robot, pairs, horizon)
     )
-    episodes = _outcome(env, state, steps, pairs, time.perf_counter() - begun, asked)
-    return replace(episodes, not_joined=not_joined)
 
 
-def _plans(key: jax.Array, env: MazeEnv, maze: Maze, pairs: Pairs, prm: PrmConfig) -> tuple[PlanTable, int]:
-    """The planner's ways to the goals, with a leading axis of one, and how many starts and goals they do not join."""
-    ends = np.stack([pairs.start, pairs.goal], 1)
-    roadmap = build_roadmap(key, maze, radius_m=env.robot.radius_m, config=prm, ends=ends)
-    grown, nodes = extend_by_pairs(roadmap, ends)
-    table = jax.tree.map(lambda leaf: leaf[None], grown.table_to(nodes[:, 1]))
-    return table, int((~grown.are_joined(nodes)).sum())
-
-
-def _outcome(
-    env: MazeEnv, state: State, steps: Steps, pairs: Pairs, wall_s: float, asked: jax.Array | None
-) -> Episodes:
-    """What happened to the pairs, from the steps of each process's own."""
-    names = ("success", "fall", "diverged", "position")
-    end = {name: state.info[name] for name in names} | {"broken": broke_off(state.info)}
-    end = own(end | {"reward": state.reward, "asked": asked}, data_mesh())
-    success, broken = end["success"] > 0, end["broken"] > 0
-    alive, path = steps.alive, steps.position
-    whole = np.concatenate([path, end["position"][None]])
-    lying = broken * end["reward"] * (env.horizon - alive.sum(0))
+def _outcome(rollout: Rollout, pairs: Pairs, wall_s: float, not_joined: int | None, beyond: int) -> Episodes:
+    """What happened to the pairs, from each process's own episodes."""
+    steps, end, n = rollout.steps, rollout.end, len(pairs.start)
+    path = np.concatenate([steps.position, end.position[None]])
+    # After an episode broke off, the robot lies where it is until the horizon.
+    lying = end.broke_off * end.reward * (rollout.horizon - steps.alive.sum(0))
+    touched = lambda flags: None if flags is None else (flags * steps.alive).sum(0) > 0  # noqa: E731
     each = {
-        "success": success,
-        "collided": (steps.collision * alive).sum(0) > 0,
-        "fell": end["fall"] > 0,
-        "diverged": end["diverged"] > 0,
-        "timeout": ~success & ~broken,
-        "steps": alive.sum(0),
-        "returns": (steps.reward * alive).sum(0) + lying,
-        "travelled_m": np.linalg.norm(np.diff(whole, axis=0), axis=-1).sum(0),
-        "asked": end["asked"],
+        "success": end.success,
+        "collided": touched(steps.collision),
+        "fell": end.fell,
+        "diverged": end.diverged,
+        "timeout": ~end.success & ~end.broke_off,
+        "steps": steps.alive.sum(0),
+        "returns": (steps.reward * steps.alive).sum(0) + lying,
+        "travelled_m": np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(0),
+        "target_return": None if steps.target_return is None else steps.target_return[0],
+        "frontal": touched(steps.frontal),
+        "grazing": touched(steps.grazing),
     }
-    n = len(pairs.start)
     each = {name: None if rows is None else joined(rows)[:n] for name, rows in each.items()}
-    every_path = joined(np.swapaxes(path, 0, 1))[:n]
-    rest = env.engine.model.nq - 2  # of qpos, with which proprioception begins
-    film = joined(np.concatenate([path[:, 0], steps.proprio[:, 0, :rest]], -1)[None])[0]
+    every_path = joined(np.swapaxes(steps.position, 0, 1))[:n]
     return Episodes(
-        **each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s, horizon=env.horizon, film=film,
-        beyond=beyond_horizon(env.robot, pairs, env.horizon),
+        **each, path=np.swapaxes(every_path, 0, 1), pairs=pairs, wall_s=wall_s, horizon=rollout.horizon,
+        proprio=joined(steps.proprio[None, :, 0])[0], not_joined=not_joined, beyond=beyond,
     )  # fmt: skip

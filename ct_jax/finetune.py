@@ -1,5 +1,6 @@
 """Planning-guided fine-tuning: the policy's failures, and the planner's recoveries from them (paper, Algorithm 4)."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
@@ -7,20 +8,18 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from ct_envs import MazeEnv, UserError
+from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Count, Share, Within
-from ct_envs.maze import Maze
-from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory, run_episodes
+from ct_jax.collect import CollectConfig, RunWave, Wave, as_wave
 from ct_jax.devices import joined
+from ct_jax.guided import Guided
 from ct_jax.numerics import with_own_numerics
-from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
-from ct_jax.rollout import Action, Controller, Guided
 from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, concatenate, select
+from ct_jax.types import Action, Controller, Frame, Guide, Policy, World
 
 
 class NoRecoveryError(UserError):
@@ -62,58 +61,87 @@ class Watching:
 class TakeoverPolicy:
     """The transformer until f(s) detects a failure; from then on the controller guided by the planner."""
 
-    own: TransformerPolicy
+    own: Policy
     guided: Guided
     config: RecoverConfig = struct.field(pytree_node=False)
 
-    def init(self, state: State, own: Any, guided: Any) -> Watching:
-        n = state.done.shape[0]
+    def init(self, frame: Frame, tasks: Any) -> Watching:
+        """The memory before the first step."""
+        n = frame.done.shape[0]
         past = jnp.full((self.config.stuck_steps, n, 2), jnp.inf, jnp.float32)
         touched = jnp.zeros((self.config.stuck_steps, n), jnp.float32)
+        own, guided = self.own.init(frame, tasks), self.guided.init(frame, tasks)
         return Watching(own, guided, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(n, bool))
 
-    def act(self, memory: Watching, state: State, key: jax.Array) -> tuple[Action, Watching]:
+    def act(self, memory: Watching, frame: Frame, key: jax.Array) -> tuple[Action, Watching]:
+        """The action of the transformer or of the planner, and the next memory."""
         own_key, guided_key, chance_key = jax.random.split(key, 3)
-        own, own_memory = self.own.act(memory.own, state, own_key)
-        guided, guided_memory = self.guided.act(memory.guided, state, guided_key)
-        position = state.info["position"]
-        rescued = memory.rescued | self._failed(memory, position)
-        rescued |= jax.random.bernoulli(chance_key, jnp.float32(self.config.takeover), rescued.shape)
-        action = jax.tree.map(lambda g, o: jnp.where(rescued.reshape(-1, *[1] * (o.ndim - 1)), g, o), guided, own)
-        if self.config.keep == "relabelled":
-            action = action._replace(label=guided.label, label_mask=jnp.ones(rescued.shape, jnp.float32))
-        else:
-            action = action._replace(label_mask=rescued.astype(jnp.float32))
-        past = jnp.concatenate([memory.past[1:], position[None]])
-        touched = jnp.concatenate([memory.touched[1:], state.info["collision"][None]])
-        return action, Watching(own_memory, guided_memory, past, touched, memory.steps + 1, rescued)
+        own, own_memory = self.own.act(memory.own, frame, own_key)
+        guided, guided_memory = self.guided.act(memory.guided, frame, guided_key)
+        at = frame.privileged
+        action, watched = _choose(self.config, _watched(memory), own, guided, at.position, at.collision, chance_key)
+        return action, Watching(own_memory, guided_memory, *watched)
 
-    def _failed(self, memory: Watching, position: jax.Array) -> Bool[Array, "N"]:
-        """f(s): the robot is stuck, touches walls repeatedly, or takes too long. (A fall ends the episode.)"""
-        stuck = jnp.linalg.norm(position - memory.past[0], axis=-1) < self.config.stuck_m
-        if self.config.bumps is not None:
-            stuck |= memory.touched.sum(0) >= self.config.bumps
-        return stuck | (memory.steps >= self.config.patience)
+
+def _watched(memory: Watching) -> tuple[jax.Array, ...]:
+    return memory.past, memory.touched, memory.steps, memory.rescued
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _choose(
+    config: RecoverConfig, watched: tuple[jax.Array, ...], own: Action, guided: Action, position: Float[Array, "N 2"],
+    collision: Float[Array, "N"], key: jax.Array,
+) -> tuple[Action, tuple[jax.Array, ...]]:  # fmt: skip
+    """Whose action is executed and which is imitated; what ``Watching`` holds next."""
+    past, touched, steps, rescued = watched
+    rescued |= _failed(config, past, touched, steps, position)
+    rescued |= jax.random.bernoulli(key, jnp.float32(config.takeover), rescued.shape)
+    intended, executed, label = (
+        jnp.where(rescued[:, None], theirs, mine) for theirs, mine in zip(guided[:3], own[:3], strict=True)
+    )
+    if config.keep == "relabelled":
+        label, mask = guided.label, jnp.ones(rescued.shape, jnp.float32)
+    else:
+        mask = rescued.astype(jnp.float32)
+    past = jnp.concatenate([past[1:], position[None]])
+    touched = jnp.concatenate([touched[1:], collision[None]])
+    return Action(intended, executed, label, mask, own.target_return), (past, touched, steps + 1, rescued)
+
+
+def _failed(
+    config: RecoverConfig, past: Float[Array, "W N 2"], touched: Float[Array, "W N"], steps: Int[Array, ""],
+    position: Float[Array, "N 2"],
+) -> Bool[Array, "N"]:  # fmt: skip
+    """f(s): the robot is stuck, touches walls repeatedly, or takes too long. (A fall ends the episode.)"""
+    stuck = jnp.linalg.norm(position - past[0], axis=-1) < config.stuck_m
+    if config.bumps is not None:
+        stuck |= touched.sum(0) >= config.bumps
+    return stuck | (steps >= config.patience)
 
 
 @with_own_numerics
 def recover(
     key: jax.Array,
-    env: MazeEnv,
-    mazes: Maze,
-    policy: TransformerPolicy,
+    world: World,
+    policy: Policy,
     controller: Controller,
     config: RecoverConfig,
     collecting: CollectConfig,
     prm: PrmConfig,
     *,
+    guide: Guide | None = None,
     on_progress: Callable[[int, int], None] = lambda recoveries, episodes: None,
+    keep: Callable[[RunWave], RunWave] = lambda wave: wave,
 ) -> Trajectories:
     """Algorithm 4: failures of the policy and the planner's recoveries from them.
 
     Args:
-        env: with maps, without auto-reset; its horizon limits failure and recovery together.
-        collecting: gives starts, guide, noise, reset interval and number of environments.
+        world: with local maps.
+        collecting: gives starts, guide, noise, reset interval, number of episodes at a time, and the horizon of a
+            recovery; the failure before it has ``config.patience`` steps more.
+        guide: a planner of one's own. By default the collection's, but "shortcut" for "roadmap": it recovers from
+            anywhere.
+        keep: see ``collect.kept_in``.
 
     Returns:
         With ``keep="separate"`` two trajectories for each recovery, otherwise one.
@@ -121,38 +149,31 @@ def recover(
     Raises:
         NoRecoveryError: no recovery within ``give_up * T`` episodes.
     """
-    guide = make_guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, env, prm)
-    maze_key, wave_key = jax.random.split(key)
-    # Each round begins at another maze, if there are many.
-    first_maze = int(jax.random.randint(maze_key, (), 0, len(mazes.cell_m), jnp.int32))
-    supervised = TakeoverPolicy(policy, Guided(controller, guide, collecting.noise), config)
+    guide = guide or world.guide("shortcut" if collecting.guide == "roadmap" else collecting.guide, prm)
+    place_key, wave_key = jax.random.split(key)
+    # Each round begins at another place, if there are many.
+    offset = int(jax.random.randint(place_key, (), 0, world.places, jnp.int32))
+    takeover = TakeoverPolicy(policy, Guided(controller, guide, collecting.noise), config)
+    horizon = config.patience + collecting.horizon
 
-    def wave(first: int) -> tuple[Trajectories, np.ndarray, np.ndarray]:
-        batch_key, run_key = jax.random.split(jax.random.fold_in(wave_key, first))
-        batch = draw_batch(
-            batch_key, env, mazes, collecting, prm, first_maze=first_maze + first // collecting.reset_interval
-        )
-        plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-        memory = supervised.init(batch.state, policy.init(batch.state), supervised.guided.init(batch.state, plan))
-        state, memory, steps = run_episodes(env, supervised, batch.state, memory, run_key, limit=env.horizon)
-        return batch.outcome(state, steps)
+    def run(first: int) -> Wave:
+        tasks = world.sample_tasks(wave_key, collecting, prm, first=first, offset=offset)
+        return as_wave(world.rollout(takeover, tasks, horizon=horizon))
 
-    return gather_recoveries(config, collecting.envs, env.horizon, wave, on_progress)
+    return gather_recoveries(config, collecting.envs, horizon, keep(run), on_progress)
 
 
 def gather_recoveries(
     config: RecoverConfig,
     envs: int,
     horizon: int,
-    wave: Callable[[int], tuple[Trajectories, np.ndarray, np.ndarray]],
+    wave: RunWave,
     on_progress: Callable[[int, int], None],
 ) -> Trajectories:
-    """The loop of Algorithm 4: supervised episodes, wave after wave, until T recoveries or ``give_up * T`` episodes.
+    """The loop of Algorithm 4: episodes, wave after wave, until T recoveries or ``give_up * T`` episodes.
 
     Args:
         envs: episodes in a wave, each of at most ``horizon`` steps.
-        wave: a function of the index of its first episode. It returns this process's share of the episodes, which of
-            them succeeded, and which broke off (see ``rollout.broke_off``).
 
     Raises:
         NoRecoveryError: as ``recover``.
@@ -162,7 +183,8 @@ def gather_recoveries(
     while recoveries < config.recoveries:
         if episodes >= config.give_up * config.recoveries:
             break
-        data, rescued, broke = wave(episodes)
+        found = wave(episodes)
+        data, rescued, broke = found.data, found.success, found.broke_off
         if config.keep == "relabelled":  # also keep the transformer's own successes and falls: they are relabelled too
             data, rescued = lie_for_ever(data, broke, horizon), rescued | broke
         else:

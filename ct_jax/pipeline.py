@@ -1,15 +1,14 @@
 """Algorithm 1, stage by stage: prm, controller, collect, fit, finetune, evaluate, report.
 
 Each stage writes into its own folder of the run; a finished stage is read back instead of run again, and what an
-interrupted one has finished is kept. What differs between mazes and rooms is asked of a ``Course``.
+interrupted one has finished is kept.
 """
 
 import functools
-import inspect
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,48 +19,22 @@ from ct_envs.robots import Robot, get_robot
 from ct_jax import devices
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.collect import collect, kept_in
 from ct_jax.controllers.sac import SacConfig
-from ct_jax.evaluate import METHODS
+from ct_jax.evaluate import METHODS, Episodes, evaluate
+from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
-from ct_jax.mazes import MazeCourse, evaluate_in_maze
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.progress import Bar, Metrics
-from ct_jax.rooms import RoomCourse, evaluate_in_rooms
-from ct_jax.run import Run, drop_leftovers, is_row, open_run, training
+from ct_jax.run import Run, drop_leftovers, is_row, kept_row, open_run, training
 from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer, with_skill
+from ct_jax.types import Controller, Policy, World
 from ct_jax.value import ValueNetwork
-
-Progress = Callable[[int, int], None]
-
-
-class Course(Protocol):
-    """Where a robot drives, and all that the pipeline asks of it."""
-
-    def controller(self, metrics: Metrics) -> tuple[Any, SacConfig]:
-        """pi_c, learned, read back or known, and its configuration."""
-        ...
-
-    def collect(self, key: jax.Array, controller: Any, folder: Path, on_progress: Progress) -> Trajectories:
-        """Algorithm 3. In the folder, it may keep what it has so far."""
-        ...
-
-    def recover(
-        self, key: jax.Array, policy: TransformerPolicy, controller: Any, folder: Path, on_progress: Progress
-    ) -> Trajectories:
-        """Failures and recoveries of one round of Algorithm 4."""
-        ...
-
-    def rows(self, folder: Path, model: TrainedModel) -> Iterator[dict[str, Any]]:
-        """The rows of the evaluation's table, each kept in the folder as soon as it is there."""
-        ...
-
-
-COURSES: dict[str, Callable[[Run], Course]] = {"maze": MazeCourse, "room": RoomCourse}
-_EVALUATIONS: dict[str, Callable[..., dict[str, Any]]] = {"maze": evaluate_in_maze, "room": evaluate_in_rooms}
+from ct_jax.worlds import Request, Trial, kind_of
 
 
 @with_own_numerics
@@ -78,25 +51,24 @@ def train(run: Run, *, resume: bool = False) -> Path:
     with open_run(run, resume=resume):
         metrics = Metrics(run.folder)
         try:
-            course = COURSES[run.spec.course](run)
-            model = _model(run, course, metrics)
-            _evaluate(run, course, model)
+            model = _model(run, metrics)
+            _evaluate(run, model)
         finally:
             metrics.close()
         return Path(devices.first(lambda: str(write_report(run.folder))))
 
 
-def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
+def _model(run: Run, metrics: Metrics) -> TrainedModel:
     """The trained model, learned or, if the stages up to it are finished, read back."""
     last = "finetune" if run.settings.rounds else "fit"
     folder = run.folder / "model"
     if run.done(last) is not None and devices.first((folder / "model.json").is_file):
         return load_model(str(run.folder))
-    controller, sac = course.controller(metrics)
-    data = planning_trajectories(run, course, controller)
+    controller, sac = kind_of(run.spec).controller(run, metrics)
+    data = planning_trajectories(run, controller)
     policy = _fit(run, controller, sac, data, metrics)
     if run.settings.rounds:
-        policy = _finetune(run, course, policy, controller, data, metrics)
+        policy = _finetune(run, policy, controller, data, metrics)
     model = TrainedModel(run.robot, replace(run.settings, sac=sac), policy, controller, run.made)
     devices.first(lambda: save_model(folder, model))
     return model
@@ -105,15 +77,20 @@ def _model(run: Run, course: Course, metrics: Metrics) -> TrainedModel:
 # -------------------------------------------------------------------------------------------- data and transformer
 
 
-def planning_trajectories(run: Run, course: Course, controller: Any) -> Trajectories:
-    """Algorithm 3's, collected or read back."""
-    file = run.folder / "collect" / "trajectories.npz"
+def planning_trajectories(run: Run, controller: Any) -> Trajectories:
+    """The trajectories of Algorithm 3, collected or read back."""
+    file, settings = run.folder / "collect" / "trajectories.npz", run.settings
     if run.done("collect") is not None:
         return _read_trajectories(run, file)
-    with run.stage("collect") as (_, info), Bar("collect", run.settings.collect.trajectories) as bar:
-        data = course.collect(
-            run.key("collect"), controller, file.parent / "waves",
-            lambda successes, episodes: bar.update(successes, f"of {episodes} episodes"),
+    with (
+        run.stage("collect") as (_, info),
+        kind_of(run.spec).open_training(run, maps=False) as world,
+        Bar("collect", settings.collect.trajectories) as bar,
+    ):
+        data = collect(
+            run.key("collect"), world, controller, settings.collect, settings.prm,
+            on_progress=lambda successes, episodes: bar.update(successes, f"of {episodes} episodes"),
+            keep=kept_in(file.parent / "waves", hint=run.hint("collect")),
         )  # fmt: skip
         storage.save(data, file)
         info |= describe(data)
@@ -207,27 +184,28 @@ def _fit_network(
 
 
 def _finetune(
-    run: Run, course: Course, policy: TransformerPolicy, controller: Any, data: Trajectories, metrics: Metrics
+    run: Run, policy: TransformerPolicy, controller: Any, data: Trajectories, metrics: Metrics
 ) -> TransformerPolicy:
     """Algorithm 4, ``rounds`` times: recoveries join the data, and training goes on."""
-    with run.stage("finetune") as (folder, info):
+    with run.stage("finetune") as (folder, info), kind_of(run.spec).open_training(run, maps=True) as world:
         for number in range(1, run.settings.rounds + 1):
-            data = storage.concatenate([data, _recoveries(run, course, number, policy, controller)])
+            data = storage.concatenate([data, _recoveries(run, world, number, policy, controller)])
             policy = _fit_both(run, "finetune", number, policy, data, metrics)
             devices.first(lambda: drop_leftovers(folder))
         info |= {"rounds": run.settings.rounds} | describe(data)
     return policy
 
 
-def _recoveries(run: Run, course: Course, number: int, policy: TransformerPolicy, controller: Any) -> Trajectories:
+def _recoveries(run: Run, world: World, number: int, policy: TransformerPolicy, controller: Any) -> Trajectories:
     """Failures and recoveries of a round."""
-    file = run.folder / "finetune" / f"trajectories-{number}.npz"
+    file, settings = run.folder / "finetune" / f"trajectories-{number}.npz", run.settings
     if storage.is_saved(file):
         return _read_trajectories(run, file)
-    with Bar(f"recover-{number}", run.settings.recover.recoveries) as bar:
-        found = course.recover(
-            run.round_keys("finetune", number)[4], policy, controller, file.parent / f"waves-{number}",
-            lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
+    with Bar(f"recover-{number}", settings.recover.recoveries) as bar:
+        found = recover(
+            run.round_keys("finetune", number)[4], world, policy, controller, settings.recover, settings.collect,
+            settings.prm, on_progress=lambda recoveries, episodes: bar.update(recoveries, f"of {episodes} episodes"),
+            keep=kept_in(file.parent / f"waves-{number}", hint=run.hint("finetune")),
         )  # fmt: skip
     storage.save(found, file)
     return found
@@ -236,12 +214,35 @@ def _recoveries(run: Run, course: Course, number: int, policy: TransformerPolicy
 # ------------------------------------------------------------------------------------------------------ evaluation
 
 
-def _evaluate(run: Run, course: Course, model: TrainedModel) -> None:
+def _evaluate(run: Run, model: TrainedModel) -> None:
     """Every method everywhere; each row is kept as soon as it is there."""
     if run.done("evaluate") is not None:
         return
     with run.stage("evaluate") as (folder, _):
-        write_json(folder / "results.json", {"rows": list(course.rows(folder, model))})
+        rows = [
+            evaluated(run, folder, trial, method, policy=model.policy, controller=model.controller)
+            for trial in kind_of(run.spec).trials(run, folder)
+            for method in METHODS
+        ]
+        write_json(folder / "results.json", {"rows": rows})
+
+
+def evaluated(
+    run: Run, folder: Path, trial: Trial, method: str, *, policy: Policy, controller: Controller | None = None
+) -> dict[str, Any]:
+    """A method's row of the table for one trial; see ``kept_row``."""
+    head = {"robot": run.robot, "method": method} | trial.head
+    measure = lambda: measured(trial, method, policy=policy, controller=controller)  # noqa: E731
+    return kept_row(folder, trial.name, method, head, measure)
+
+
+def measured(trial: Trial, method: str, *, policy: Policy, controller: Controller | None = None) -> Episodes:
+    """Run a method on a trial, with a bar."""
+    with Bar(f"{method} in {trial.name}", len(trial.pairs.start)) as bar:
+        return evaluate(
+            trial.world, trial.pairs, method, policy=policy, controller=controller, prm=trial.prm,
+            horizon=trial.horizon, on_progress=bar.update,
+        )  # fmt: skip
 
 
 def results(folder: Path) -> list[dict[str, Any]]:
@@ -264,7 +265,7 @@ def evaluate_model(
     Args:
         keep: told the row as soon as it is there, before anything is drawn.
         return_scale: k, in place of the model's own.
-        options: of ``evaluate_in_maze`` or ``evaluate_in_rooms``, whichever the robot is for.
+        options: of the ``Request`` of the robot's kind of world.
 
     Raises:
         UserError: unknown model, method or maze, an option that is not for this robot, or one out of its range.
@@ -275,16 +276,29 @@ def evaluate_model(
     model = load_model(run)
     robot = get_robot(model.robot)
     _check_processes(robot)
-    evaluation = _EVALUATIONS[robot.course]
-    known = inspect.signature(evaluation).parameters
-    known = [name for name, parameter in known.items() if parameter.kind is parameter.KEYWORD_ONLY]
+    kind = kind_of(robot)
+    known = [option.name for option in fields(kind.Request)]  # pyright: ignore[reportArgumentType]
     for name in options:
         if name not in known:
             raise UserError(f"--{name} is not for the {model.robot}; its options: --{', --'.join(known)}")
     asked = {}
     if return_scale is not None:
         model, asked = _asking(model, method, return_scale), {"return_scale": return_scale}
-    return evaluation(model, method, seed, lambda row: keep(row | asked), **options) | asked
+    return answer(kind.Request(**options), model, method, seed, lambda row: keep(row | asked)) | asked
+
+
+def answer(
+    request: Request, model: TrainedModel, method: str, seed: int,
+    keep: Callable[[dict[str, Any]], None] = lambda row: None,
+) -> dict[str, Any]:  # fmt: skip
+    """The row of one method of a model; ``keep`` as in ``evaluate_model``. Raises UserError."""
+    request.check(model)
+    with request.open(model, seed) as trial:
+        episodes = measured(trial, method, policy=model.policy, controller=model.controller)
+        row = {"robot": model.robot, "method": method} | trial.head | episodes.summary()
+        keep(row)
+        request.show(trial, f"{model.robot}, {method} in {trial.name}", episodes)
+    return row
 
 
 def _asking(model: TrainedModel, method: str, return_scale: float) -> TrainedModel:

@@ -24,7 +24,7 @@ from typing import Any
 
 import jax
 
-from ct_envs import Maze, MazeEnv, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
+from ct_envs import Maze, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
 from ct_envs.robots import Robot, get_robot
 from ct_jax import __version__, devices
@@ -50,10 +50,6 @@ class Run:
     eval_mazes: dict[str, Maze]  # evaluated in besides them
     seed: int
     engine: str
-
-    def env(self, **options: Any) -> MazeEnv:
-        """The run's environment, with options of ``MazeEnv``."""
-        return MazeEnv(self.robot, engine=self.engine, map_cell_m=self.settings.model.map_cell_m, **options)
 
     def key(self, stage: str) -> jax.Array:
         """The stage's own randomness."""
@@ -199,8 +195,9 @@ def _save_episodes(file: Path, episodes: Episodes) -> None:
     """Write what happened, for the report's pictures."""
     arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "fell", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
-    more = {name: getattr(episodes, name) for name in ("asked", "frontal", "grazing", "diverged")}
-    more |= {"world": episodes.pairs.world}
+    more = {name: getattr(episodes, name) for name in ("frontal", "grazing", "diverged")}
+    place = episodes.pairs.place
+    more |= {"asked": episodes.target_return, "world": place if place.any() else None}
     arrays |= {name: array for name, array in more.items() if array is not None}
     save_arrays(file, **arrays)
 

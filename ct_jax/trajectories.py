@@ -20,6 +20,7 @@ from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
 from ct_jax import devices
 from ct_jax.files import save_arrays
+from ct_jax.types import Rollout, Steps
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps
 _MAP_SHAPE = (2, MAP_CELLS, MAP_CELLS)
@@ -85,6 +86,21 @@ def pack_maps(maps: UInt8[np.ndarray, "*b 2 k k"]) -> UInt8[np.ndarray, "*b 157"
 def unpack_maps(bits: UInt8[Array, "*b 157"]) -> UInt8[Array, "*b 2 k k"]:
     """The inverse of ``pack_maps``; also works under jit."""
     return jnp.unpackbits(bits, axis=-1, count=_MAP_BITS).reshape(*bits.shape[:-1], *_MAP_SHAPE)
+
+
+def to_trajectories(rollout: Rollout) -> Trajectories:
+    """The record of a rollout as trajectories with final goals.
+
+    Rewards are those of the final goal (paper, sec. III-C). The worlds already give them: their rewards do not depend
+    on the waypoints that the controller followed.
+    """
+    steps = Steps(*(None if leaf is None else np.swapaxes(leaf, 0, 1) for leaf in rollout.steps))
+    return Trajectories(
+        position=steps.position, proprio=steps.proprio, action=steps.action, label=steps.label, reward=steps.reward,
+        label_mask=steps.label_mask * steps.alive, collision=steps.collision * steps.alive,
+        goal_world=rollout.goal_world, maze=np.asarray(rollout.place, np.int32),
+        length=steps.alive.sum(1).astype(np.int32), goal_relative=steps.goal_relative, map_bits=steps.map_bits,
+    )  # fmt: skip
 
 
 def at_goal(reward: jax.Array | np.ndarray, tolerance_m: float) -> jax.Array | np.ndarray:

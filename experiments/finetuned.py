@@ -18,11 +18,12 @@ from study import as_digits, digest_arrays, load_variants
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
-from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.files import prepare_outputs
 from ct_jax.model import load_model
 from ct_jax.progress import Bar
 from ct_jax.run import provenance
+from ct_jax.worlds.mazes import MazeWorld
 
 FILE = RESULTS / "finetuned.json"
 LONGER = "long-ct"  # CT with about the same total number of updates as F-CT
@@ -54,13 +55,10 @@ def measure(options: Options, variant: str, seed: int, maze_name: str) -> Row:
     run = (options.runs or Path("runs") / options.robot) / f"{variant}-{seed}"
     model, maze = load_model(str(run)), load_maze(maze_name)
     env = MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
-    robot = env.robot
-    pairs = draw_pairs(PAIRS_SEED, maze, options.pairs, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    world = MazeWorld(env, maze)
+    pairs = world.draw_pairs(PAIRS_SEED, options.pairs)
     with Bar(f"{run.name} in {maze_name}", options.pairs) as bar:
-        episodes = evaluate(
-            env, maze, pairs, CT, policy=model.policy,
-            on_progress=lambda steps, over: bar.update(over, f"step {steps}"),
-        )  # fmt: skip
+        episodes = evaluate(world, pairs, CT, policy=model.policy, on_progress=bar.update)
     head = {
         "robot": model.robot, "variant": variant, "method": CT, "maze": maze_name, "seen": False, "model_seed": seed,
         "episodes": options.pairs, "seed": PAIRS_SEED, "controller": digest_arrays(model.controller),

@@ -19,10 +19,12 @@ from rows import CT
 from ct_envs import Maze, MazeEnv, UserError, load_maze
 from ct_envs.maze import unpadded
 from ct_jax.cli import guarded, leave, prepare_jax
-from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.files import check_writable, whole
 from ct_jax.model import load_model
 from ct_jax.report.video import check_video, write_video
+from ct_jax.worlds.maze_runs import as_film
+from ct_jax.worlds.mazes import MazeWorld
 
 WALL, FLOOR, PATH, ROBOT, GOAL = "#8d99a6", "#ffffff", "#1b6ca8", "#e07b28", "#ffe000"
 COLOURS = 128
@@ -82,17 +84,16 @@ def main(options: Options) -> None:
     prepare_jax()
     model, maze = load_model(options.run), load_maze(options.maze)
     env = MazeEnv(model.robot, map_cell_m=model.settings.model.map_cell_m, auto_reset=False)
-    robot = env.robot
-    pairs = draw_pairs(options.seed, maze, 1, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
-    episodes = evaluate(env, maze, pairs, CT, policy=model.policy)
+    robot, world = env.robot, MazeWorld(env, maze)
+    pairs = world.draw_pairs(options.seed, 1)
+    episodes = evaluate(world, pairs, CT, policy=model.policy)
     if not episodes.success[0]:
         raise UserError(f"--seed {options.seed}: the robot does not reach this goal; try another seed")
-    assert episodes.film is not None
     steps = int(episodes.steps[0])
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / "episode.mp4"
         check_video(video)
-        write_video(video, robot, maze, episodes.film[:steps], pairs.goal[0], options.run)
+        write_video(video, robot, maze, as_film(robot.name, episodes), pairs.goal[0], options.run)
         filmed = list(frames_of(video, options.speed))
     path = episodes.path[:steps, 0]
     pictures = []

@@ -33,7 +33,6 @@ from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import GUIDED
 from ct_jax.files import prepare_outputs
 from ct_jax.finetune import NoRecoveryError
-from ct_jax.mazes import evaluated
 from ct_jax.model import load_controller
 from ct_jax.presets import get_preset
 from ct_jax.progress import Metrics
@@ -42,7 +41,6 @@ from ct_jax.run import (
     default_mazes,
     episodes_file,
     identity,
-    join_mazes,
     load_mazes,
     open_run,
     provenance,
@@ -50,6 +48,8 @@ from ct_jax.run import (
 )
 from ct_jax.settings import Settings, to_dict
 from ct_jax.terminal import printable
+from ct_jax.worlds import kind_of
+from ct_jax.worlds.maze_runs import make_env
 
 SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
 
@@ -418,10 +418,10 @@ def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
 def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
     """Rows of PT-CQL, learned from the run's planning trajectories, which are collected where they are missing."""
     with open_run(run, resume=True):
-        course, metrics = pipeline.COURSES[run.spec.course](run), Metrics(run.folder)
-        controller, _ = course.controller(metrics)
+        metrics = Metrics(run.folder)
+        controller, _ = kind_of(run.spec).controller(run, metrics)
         metrics.close()
-        pipeline.planning_trajectories(run, course, controller)
+        pipeline.planning_trajectories(run, controller)
 
     def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
         data = storage.load(run.folder / "collect" / "trajectories.npz")
@@ -435,7 +435,7 @@ def sac_alone(run: Run, config: SacConfig) -> list[dict[str, Any]]:
     """Rows of SAC alone in the run's maze, without its data."""
 
     def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
-        return train_sac_alone(key, run.env, next(iter(run.mazes.values())), config, **watch)
+        return train_sac_alone(key, functools.partial(make_env, run), next(iter(run.mazes.values())), config, **watch)
 
     return baseline(run, "sac", learn, config, config.iterations, config.hidden[0])
 
@@ -449,7 +449,7 @@ def baseline(
     """Rows of one baseline. It is trained first unless its weights exist."""
     frame, stage = config.frame, f"baselines/{name}"
     folder = run.folder / stage
-    env = run.env(auto_reset=False)
+    env = make_env(run, auto_reset=False)
     actor = Actor(env.action_size, width, frame)
     params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
     policy = ActorPolicy(params, env.action_size, width, frame)
@@ -465,6 +465,6 @@ def baseline(
                 metrics.close()
                 save_weights(file, learned.params)
         policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
-        mazes = join_mazes(run.mazes, run.eval_mazes).items()
-        rows = [evaluated(run, env, folder, at, maze, name, policy=policy) for at, maze in mazes]
+        trials = kind_of(run.spec).trials(run, run.folder / "evaluate")
+        rows = [pipeline.evaluated(run, folder, trial, name, policy=policy) for trial in trials]
     return [made | {"settings": digest(run.settings, config)} | row | outcomes(folder, row) for row in rows]

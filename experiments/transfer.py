@@ -24,7 +24,7 @@ from ct_jax import pipeline
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax
-from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.files import prepare_outputs
 from ct_jax.fit import Fit, fit, init_params
 from ct_jax.model import TrainedModel, load_model
@@ -32,6 +32,7 @@ from ct_jax.progress import Bar
 from ct_jax.run import provenance, random_mazes
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
+from ct_jax.worlds.mazes import MazeWorld
 
 FILE = RESULTS / "transfer.json"
 
@@ -96,8 +97,9 @@ def curve(
     params = init_params(init_key, policy.model, target.data, policy.params)
     if source is not None:
         params = transfer(source.policy.params, params)
-    robot, (name, maze) = target.env.robot, target.unseen
-    pairs = draw_pairs(0, maze, options.episodes, radius_m=robot.radius_m, tolerance_m=robot.goal_tolerance_m)
+    name, maze = target.unseen
+    world = MazeWorld(target.env, maze)
+    pairs = world.draw_pairs(0, options.episodes)
     # Save after every chunk, so that each mark continues from the one before.
     checkpoints = Checkpoints(folder / "checkpoints", every_s=0.0)
     rows, made = [], provenance()
@@ -109,7 +111,7 @@ def curve(
                     fit_key, target.learner, params, target.data, target.mazes, updates=mark, checkpoints=checkpoints,
                     on_progress=lambda update, loss: bar.update(update, f"loss {loss:.4f}"),
                 )  # fmt: skip
-                episodes = evaluate(target.env, maze, pairs, CT, policy=replace(policy, params=params_now))
+                episodes = evaluate(world, pairs, CT, policy=replace(policy, params=params_now))
                 row = {"updates": mark, "maze": name, "episodes": options.episodes} | episodes.summary()
                 write_json(file, row | origin_of(made))
             rows.append(read_json(file))

@@ -28,8 +28,9 @@ from ct_jax.cli import guarded, leave
 from ct_jax.evaluate import GUIDED
 from ct_jax.files import make_folder, prepare_outputs
 from ct_jax.model import TrainedModel, load_model
-from ct_jax.rooms import evaluate_in_rooms, evaluate_seven_pairs
+from ct_jax.pipeline import answer, measured
 from ct_jax.run import Run
+from ct_jax.worlds.room_runs import Request, SevenPairs, grades
 
 DENSITIES = (0.5, 1.5, 2.0)  # besides 1, at which every variant is measured
 LEVELS = (0.5, 1.0, 2.0)  # besides 0, at which every variant is measured
@@ -99,15 +100,23 @@ def sweep(run: Run, name: str, kinds: tuple[str, ...], *, references: bool) -> I
                 yield kind, label(run, name, values)
 
 
+def seven_pairs(model: TrainedModel, method: str, noise: float) -> dict[str, Any]:
+    """The paper's protocol on the real robot, counted as the paper counts."""
+    with SevenPairs(noise).open(model) as trial:
+        episodes = measured(trial, method, policy=model.policy, controller=model.controller)
+        head = {"robot": model.robot, "method": method} | trial.head
+    return head | grades(episodes) | episodes.summary()
+
+
 Measure = Callable[[TrainedModel, str, int, float, dict[str, int]], dict[str, Any]]
 _MEASURES: dict[str, tuple[tuple[float, ...], Measure]] = {
     "density": (
-        DENSITIES, lambda model, method, seed, at, where: evaluate_in_rooms(model, method, seed, density=at, **where),
+        DENSITIES, lambda model, method, seed, at, where: answer(Request(density=at, **where), model, method, seed),
     ),
     "noise": (
-        LEVELS, lambda model, method, seed, at, where: evaluate_in_rooms(model, method, seed, noise=at, **where),
+        LEVELS, lambda model, method, seed, at, where: answer(Request(noise=at, **where), model, method, seed),
     ),
-    "seven": (SEVEN_LEVELS, lambda model, method, seed, at, where: evaluate_seven_pairs(model, method, noise=at)),
+    "seven": (SEVEN_LEVELS, lambda model, method, seed, at, where: seven_pairs(model, method, at)),
 }  # fmt: skip
 
 

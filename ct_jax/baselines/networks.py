@@ -5,14 +5,13 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 from brax.training.distribution import NormalTanhDistribution
 from flax import struct
 from jaxtyping import Array, Float, UInt8
 
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.rollout import Action, act_as_intended
 from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_features, directions, goal_features
+from ct_jax.types import Action, Frame, act_as_intended
 
 
 class Seen(NamedTuple):
@@ -92,15 +91,14 @@ class ActorPolicy:
     width: int = struct.field(pytree_node=False)
     frame: str = struct.field(pytree_node=False, default="world")
 
-    def init(self, state: State) -> tuple[()]:
+    def init(self, frame: Frame, tasks: Any = None) -> tuple[()]:
         """The memory of N episodes: it is empty."""
-        del state
+        del frame, tasks
         return ()
 
-    def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
+    def act(self, memory: tuple[()], frame: Frame, key: jax.Array) -> tuple[Action, tuple[()]]:
         """The next actions in N environments with maps, and the empty memory."""
         del key
-        obs: dict = state.obs  # pyright: ignore
         actor = Actor(self.action_size, self.width, self.frame)
-        logits: Any = actor.apply(self.params, Seen(obs["map"], obs["proprio"], obs["goal"]))
+        logits: Any = actor.apply(self.params, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))
         return act_as_intended(tanh_gaussian(self.action_size).mode(logits)), memory

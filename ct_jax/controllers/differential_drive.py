@@ -1,6 +1,7 @@
 """The known controller of a differential-drive robot (paper, sec. IV-B): it is not learned and sees only the goal."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +19,11 @@ class DifferentialDrive:
     # it drives and does not cut corners. 0 gives the paper's controller.
     turn_first: float = 2.0
 
-    def __call__(self, goal_heading: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    action_size: ClassVar[int] = 2
+
+    def __call__(self, proprio: object, goal_heading: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Actions [*n, 2], in shares of the top speeds, for goals in the robot's own frame [*n, 2] (m)."""
+        del proprio
         distance = np.linalg.norm(goal_heading, axis=-1)
         angle = np.arctan2(goal_heading[..., 1], goal_heading[..., 0])
         v_mps = self.v_gain_per_s * distance

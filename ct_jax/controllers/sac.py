@@ -27,10 +27,12 @@ from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.frames import FrameName, own_frame, symmetries, transform, turn
 from ct_envs.maze import Maze
+from ct_envs.maze_env import broke_off
 from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
-from ct_jax.rollout import Action, Controller, act_as_intended, broke_off, rollout
+from ct_jax.types import Action, Controller, Frame, act_as_intended
+from ct_jax.worlds.mazes import run as rollout
 
 Metres = Annotated[float, Within(0, 1_000_000)]  # also for other terms of the reward
 
@@ -523,9 +525,15 @@ class Steered:
 
     controller: Controller
 
-    def act(self, memory: tuple[()], state: State, key: jax.Array) -> tuple[Action, tuple[()]]:
-        action = self.controller(state.obs["proprio"], state.obs["goal"])  # pyright: ignore
-        return act_as_intended(action), memory
+    def init(self, frame: Frame, tasks: Any = None) -> tuple[()]:
+        """There is nothing to remember."""
+        del frame, tasks
+        return ()
+
+    def act(self, memory: tuple[()], frame: Frame, key: jax.Array) -> tuple[Action, tuple[()]]:
+        """The controller's actions."""
+        del key
+        return act_as_intended(self.controller(frame.obs.proprio, frame.obs.goal_relative)), memory
 
 
 def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:

@@ -113,6 +113,11 @@ class MazeState(State):
 jax.tree_util.register_dataclass(MazeState, [*State.__dataclass_fields__], [])
 
 
+def broke_off(info: dict[str, Any]) -> Float[Array, "*b"]:
+    """1 where an episode ended by a fall or because something was not finite, else 0. (The last step's ``info``.)"""
+    return jnp.maximum(info["fall"], info["diverged"])
+
+
 class MazeEnv(Env):
     """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-G).
 
@@ -164,14 +169,17 @@ class MazeEnv(Env):
         self.engine = make_engine(engine, self.robot, cell_m=cell_m)
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
         self.horizon = horizon or self.robot.horizon
+        self._with_horizon: dict[int, MazeEnv] = {self.horizon: self}  # shared with those that it holds
         self._ctrl_max = self.engine.model.actuator_ctrlrange[:, 1].astype(np.float32)
         self._reset_velocity = self.robot.reset_velocity_mps if reset_velocity_mps is None else reset_velocity_mps
 
     def with_horizon(self, horizon: int) -> "MazeEnv":
-        """The same environment with episodes of so many control steps."""
-        changed = copy.copy(self)
-        changed.horizon = horizon
-        return changed if horizon != self.horizon else self
+        """The same environment with episodes of so many control steps: always the same one, so it compiles once."""
+        if horizon not in self._with_horizon:
+            changed = copy.copy(self)
+            changed.horizon = horizon
+            self._with_horizon[horizon] = changed
+        return self._with_horizon[horizon]
 
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

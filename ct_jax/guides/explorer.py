@@ -6,6 +6,7 @@ position and the size and alignment of the maze's cells.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ct_envs.maze import Maze, cell_of, in_sight, is_wall, segment_reach
 from ct_envs.occupancy import MAP_CELLS
+from ct_jax.types import Frame
 
 
 @struct.dataclass
@@ -32,16 +34,18 @@ class ExplorerGuide:
     cell_m: float
     look_m: float = 10.0  # largest distance of a waypoint [m]; the controller was trained on edges up to this length
 
-    def init(self, maze: Maze) -> Seen:
-        """The memory before anything is seen. ``maze`` has a leading axis N, here and below."""
-        return Seen(jnp.zeros(maze.walls.shape, bool))
+    def init(self, frame: Frame, tasks: Any = None) -> Seen:
+        """The memory before anything is seen."""
+        del tasks
+        return Seen(jnp.zeros(frame.privileged.scene.walls.shape, bool))
 
-    def waypoint(self, seen: Seen, maze: Maze, position: Float[Array, "N 2"], goal: Float[Array, "N 2"]):
-        """Targets [N, 2] (m), and the cells seen so far."""
+    def waypoint(self, seen: Seen, frame: Frame) -> tuple[Float[Array, "N 2"], Seen]:
+        """Vectors to the waypoints [N, 2] (m), and the cells seen so far."""
+        maze, position, goal = frame.privileged.scene, frame.privileged.position, frame.privileged.goal_world
         seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
         believed = maze.replace(walls=maze.walls & seen.cells)
         to_go = _distances(believed, goal)
-        return jax.vmap(self._choose)(believed, to_go, position, goal), seen
+        return jax.vmap(self._choose)(believed, to_go, position, goal) - position, seen
 
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
         """Cells of which the local map at ``position`` shows at least one point."""

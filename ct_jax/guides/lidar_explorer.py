@@ -5,6 +5,7 @@ grid. Its positions come from odometry, so it knows the room only by what it saw
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +15,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from ct_envs.lidar import LIDAR_BEAMS, LIDAR_CELL_M, LIDAR_RANGE_M
 from ct_envs.turtlebot3 import to_heading
-from ct_envs.turtlebot3_pool import Frame
+from ct_envs.turtlebot3_pool import Frame as PoolFrame
+from ct_jax.types import Frame
 
 _NEAR = 0.15  # first share of a straight path that is not checked: the robot may already be too close to an obstacle
 _DEAR = 30.0  # cost factor of cells that are too close to an obstacle: a last resort
@@ -33,7 +35,7 @@ class Charted:
 
 
 @dataclass(frozen=True)
-class ExplorerGuide:
+class LidarExplorer:
     """Optimistic replanning on the lidar's grid, for the slots of a pool."""
 
     clear_m: float  # smallest distance between the robot's centre and an obstacle
@@ -43,17 +45,21 @@ class ExplorerGuide:
     every: int = 5  # steps between two plans
     look_m: float = 0.8  # largest distance of a waypoint: inside the lidar's range
 
-    def init(self, frame: Frame, *_: object) -> tuple[Charted, ...]:
+    def init(self, frame: Frame, tasks: Any = None) -> tuple[Charted, ...]:
         """The memory before anything is seen."""
-        n = round(self.side_m / self.cell_m)
-        goal = _in_world(frame, frame.goal)
+        del tasks
+        seen, n = frame.privileged.scene, round(self.side_m / self.cell_m)
+        goal = _in_world(seen, seen.goal)
         return tuple(
             Charted(position - self.side_m / 2, goal[slot], np.zeros((n, n), bool))
-            for slot, position in enumerate(frame.believed_position)
+            for slot, position in enumerate(seen.believed_position)
         )
 
     def waypoint(self, memory: tuple[Charted, ...], frame: Frame) -> tuple[np.ndarray, tuple[Charted, ...]]:
-        """Vectors to targets [N, 2] (m), and the grids so far."""
+        """Vectors to the waypoints [N, 2] in the robots' own frames (m), and the grids so far."""
+        return self._waypoint(memory, frame.privileged.scene)
+
+    def _waypoint(self, memory: tuple[Charted, ...], frame: PoolFrame) -> tuple[np.ndarray, tuple[Charted, ...]]:
         here, met = frame.believed_position, frame.ranges < LIDAR_RANGE_M
         ends = _beam_ends(frame)
         charts = [
@@ -137,13 +143,13 @@ def _grid(cost: np.ndarray) -> csr_array:
     return csr_array((np.concatenate(weights), entries), shape=(cost.size,) * 2)
 
 
-def _beam_ends(frame: Frame) -> Float[np.ndarray, "N 360 2"]:
+def _beam_ends(frame: PoolFrame) -> Float[np.ndarray, "N 360 2"]:
     """The ends of the beams in the frame of the odometry [m]. The ends of beams that hit nothing are not valid."""
     angle = frame.believed_yaw_rad[:, None] + np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS)
     ranges = np.minimum(frame.ranges, LIDAR_RANGE_M)[..., None]
     return frame.believed_position[:, None] + ranges * np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
-def _in_world(frame: Frame, vector: np.ndarray) -> np.ndarray:
+def _in_world(frame: PoolFrame, vector: np.ndarray) -> np.ndarray:
     """Points [N, 2] in the frame of the odometry (m), from vectors in the robots' own frames."""
     return frame.believed_position + to_heading(vector, -frame.believed_yaw_rad)

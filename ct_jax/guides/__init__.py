@@ -1,0 +1,1 @@
+"""Planners that give waypoints: one file each. ``World.guide`` makes them."""
