@@ -138,7 +138,7 @@ def faulty():
     import jax.numpy as jnp
     from flax import struct
 
-    from ct_jax.rollout import act_as_intended
+    from ct_jax.types import act_as_intended
 
     @struct.dataclass
     class Faulty:
@@ -147,10 +147,10 @@ def faulty():
         step: int = 3
         size: int = struct.field(pytree_node=False, default=2)
 
-        def init(self, state, *_):
+        def init(self, frame, tasks=None):
             return jnp.zeros((), jnp.int32)
 
-        def act(self, memory, state, key):
+        def act(self, memory, frame, key):
             bad = jnp.asarray(self.which) & (memory >= self.step)
             action = jnp.zeros((*bad.shape, self.size))
             return act_as_intended(action.at[:, -1].set(jnp.where(bad, self.value, 0.0))), memory + 1

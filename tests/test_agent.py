@@ -9,10 +9,9 @@ import pytest
 
 import ct_jax
 from ct_envs import MazeEnv, load_maze, stack_mazes
-from ct_jax.collect import start_episodes
 from ct_jax.model import sizes
-from ct_jax.policy import TransformerPolicy
-from ct_jax.rollout import rollout
+from ct_jax.transformer import ControlTransformer
+from ct_jax.worlds.mazes import as_frame, run, start_episodes
 
 ROBOTS = ("point", "ant", "humanoid", "turtlebot3")
 N, STEPS = 3, 5
@@ -51,7 +50,7 @@ def test_an_agent_acts_as_in_an_evaluation():
     begin = jnp.array([[6.0, 6.0], [14.0, 6.0], [6.0, 14.0]])
     start = start_episodes(env, jax.random.split(jax.random.key(0), N), mazes, begin, begin[::-1] + 0.7)
     with jax.default_matmul_precision("highest"):
-        _, _, steps = rollout(env, model.policy, start, model.policy.init(start), jax.random.key(0), STEPS)
+        _, _, steps = run(env, model.policy, start, model.policy.init(as_frame(start)), jax.random.key(0), STEPS)
     step, state, memory = jax.jit(jax.vmap(env.step)), start, agent.init(start.obs)
     for recorded in np.asarray(steps.action):
         action, memory = agent.act(memory, state.obs, state.reward)
@@ -72,13 +71,13 @@ def test_a_batch_of_one_acts_as_a_row_of_many(robot):
 
 
 def test_each_batch_size_compiles_once(monkeypatch):
-    traced, own = [], TransformerPolicy.act
+    traced, own = [], ControlTransformer.act
 
-    def act(self, memory, state, key):
-        traced.append(len(state.done))
-        return own(self, memory, state, key)
+    def act(self, cache, maps, *inputs):
+        traced.append(len(maps))
+        return own(self, cache, maps, *inputs)
 
-    monkeypatch.setattr(TransformerPolicy, "act", act)
+    monkeypatch.setattr(ControlTransformer, "act", act)
     for n in (5, 6, 5, 6):
         act_along(agent_of("turtlebot3"), [observe("turtlebot3", n)] * 3, [np.zeros(n)] * 3)
     assert traced == [5, 6]

@@ -10,9 +10,9 @@ import pytest
 from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql, transitions
 from ct_jax.checkpoint import Checkpoints
-from ct_jax.collect import start_episodes
-from ct_jax.rollout import rollout
 from ct_jax.trajectories import sample_windows, select
+from ct_jax.worlds.mazes import as_frame, start_episodes
+from ct_jax.worlds.mazes import run as roll_out
 
 UMAZE = load_maze("antmaze-umaze")
 MAZES = stack_mazes([UMAZE])
@@ -182,11 +182,11 @@ def test_the_better_action_is_imitated(careful, fork):
     state = start_episodes(
         env, jax.random.split(jax.random.key(0), 1), MAZES, jnp.array([[6.0, 6.0]]), jnp.array([[6.8, 6.0]])
     )
-    action, memory = policy.act(policy.init(state), state, jax.random.key(0))
-    again, _ = policy.act(memory, state, jax.random.key(1))
+    action, memory = policy.act((), as_frame(state), jax.random.key(0))
+    again, _ = policy.act(memory, as_frame(state), jax.random.key(1))
     np.testing.assert_allclose(action.executed[0], [0.7, 0.0], atol=0.3)
     np.testing.assert_array_equal(action.executed, again.executed)  # without chance
-    _, _, steps = rollout(env, policy, state, policy.init(state), jax.random.key(0), 5)
+    _, _, steps = roll_out(env, policy, state, (), jax.random.key(0), 5)
     assert np.isfinite(steps.reward).all()
 
 

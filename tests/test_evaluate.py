@@ -10,28 +10,25 @@ from flax import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import ct_jax
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
-from ct_jax.collect import run_episodes
 from ct_jax.devices import data_mesh, fill_up
 from ct_jax.evaluate import (
     Episodes,
-    Pairs,
-    beyond_horizon,
     bootstrap,
     check_horizon,
-    draw_pairs,
     evaluate,
-    horizon_for,
-    shortest_ways,
     wilson,
 )
-from ct_jax.mazes import head
+from ct_jax.pairs import Pairs, beyond_horizon, horizon_for, shortest_ways
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
-from ct_jax.rollout import act_as_intended
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+from ct_jax.types import act_as_intended
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds.maze_runs import Request, as_film
+from ct_jax.worlds.mazes import MazeWorld
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -40,7 +37,7 @@ MAZES = {name: load_maze(name) for name in ("antmaze-large", "antmaze-large-eval
 
 
 def draw(maze, n=20, seed=0):
-    return draw_pairs(seed, maze, n, radius_m=POINT.radius_m, tolerance_m=POINT.goal_tolerance_m)
+    return MazeWorld(ENV, maze).draw_pairs(seed, n)
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +81,7 @@ def test_ways_that_no_roadmap_knows_are_counted():
     maze = MAZES["antmaze-large"]
     pairs = draw(maze)
     config = PrmConfig(samples=5, most_samples=5)
-    way, straight = shortest_ways(
-        jax.random.key(0), maze, pairs.start, pairs.goal, radius_m=POINT.radius_m, config=config
-    )
+    way, straight = shortest_ways(jax.random.key(0), maze, pairs.ends, radius_m=POINT.radius_m, config=config)
     lines = np.isclose(way, np.linalg.norm(pairs.start - pairs.goal, axis=1))
     assert 0 < straight <= lines.sum()
     assert episodes(pairs=replace(pairs_of(4), straight=3)).summary()["straight_ways"] == 3
@@ -113,7 +108,7 @@ def test_the_horizon_grows_with_the_longest_way():
 def test_episodes_last_as_long_as_the_horizon(pairs, push, horizon):
     """And pairs beyond it are counted."""
     maze, few = MAZES["antmaze-large"], pairs["antmaze-large"]
-    done = evaluate(ENV, maze, few, "planner", controller=push(), horizon=horizon)
+    done = evaluate(MazeWorld(ENV, maze), few, "planner", controller=push(), horizon=horizon)
     assert done.horizon == (horizon or ENV.horizon) and done.steps.max() <= done.horizon
     assert done.summary()["beyond_horizon"] == beyond_horizon(POINT, few, done.horizon)
     assert done.summary()["not_joined"] == 0
@@ -183,7 +178,8 @@ def test_spl():
 
 
 def test_the_row_of_the_table_has_what_other_tools_rely_on():
-    row = head("point", "ct", "hall", 4, 3) | episodes().summary()
+    with Request(maze="hall", episodes=4).open(ct_jax.load("zoo:point"), 3) as trial:
+        row = {"robot": "point", "method": "ct"} | trial.head | episodes().summary()
     contract = (
         "robot method maze episodes seed success_rate success_ci95 return_mean return_scaled spl collision_rate "
         "timeout_rate steps_mean wall_s"
@@ -204,7 +200,7 @@ def test_the_row_of_the_table_has_what_other_tools_rely_on():
 def test_the_references_reach_every_goal(pairs, push, method):
     """With a controller that does as it is told, in both of the paper's mazes; in about the shortest ways."""
     for name, maze in MAZES.items():
-        done = evaluate(ENV, maze, pairs[name], method, controller=push())
+        done = evaluate(MazeWorld(ENV, maze), pairs[name], method, controller=push())
         assert done.success.all(), (name, np.flatnonzero(~done.success))
         row = done.summary()
         assert row["success_rate"] == 1.0 and row["timeout_rate"] == 0.0
@@ -222,21 +218,22 @@ def test_what_is_reported_is_what_happened(push):
     two = Pairs(start, goal, np.float32([6, 8]), 0)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=40)
 
-    done = evaluate(env, maze, two, "planner", controller=push())
+    done = evaluate(MazeWorld(env, maze), two, "planner", controller=push())
     path, steps = done.path, done.steps.astype(int)
     assert done.success[0] and 10 < steps[0] < 40
     away = np.linalg.norm(path[1 : steps[0], 0] - goal[0], axis=1)
     assert -done.returns[0] == pytest.approx(away.sum(), abs=POINT.goal_tolerance_m)
     assert done.travelled_m[0] == pytest.approx(5.5, abs=0.5)
     assert done.summary()["spl"] <= 1
-    np.testing.assert_array_equal(done.film, path[:, 0])  # a point's coordinates are its position
+    film = as_film("point", done)
+    np.testing.assert_array_equal(film, path[: len(film), 0])  # a point's coordinates are its position
 
-    blind = evaluate(env, maze, two, "planner", controller=push(0.0))
+    blind = evaluate(MazeWorld(env, maze), two, "planner", controller=push(0.0))
     np.testing.assert_array_equal(blind.success, False)
     np.testing.assert_array_equal(blind.timeout, True)
     np.testing.assert_array_equal(blind.steps, 40)
     np.testing.assert_allclose(blind.returns, [-6 * 40, -8 * 40], rtol=1e-4)
-    assert blind.summary()["spl"] == 0 and blind.asked is None
+    assert blind.summary()["spl"] == 0 and blind.target_return is None
 
 
 @pytest.fixture(scope="module")
@@ -255,20 +252,20 @@ def test_the_transformer_is_asked_for_its_value(policy, pairs):
         name: getattr(pairs["antmaze-large"], name)[:2] for name in ("start", "goal", "shortest_m")
     })  # fmt: skip
     seen = []
-    done = evaluate(env, MAZES["antmaze-large"], few, "ct", policy=policy, on_progress=lambda *at: seen.append(at))
-    assert done.asked is not None and (done.asked <= 0).all() and done.asked.shape == (2,)
-    assert done.path.shape == (50, 2, 2) and seen == [(50, 2)]
+    done = evaluate(
+        MazeWorld(env, MAZES["antmaze-large"]), few, "ct", policy=policy, on_progress=lambda *at: seen.append(at)
+    )
+    assert done.target_return is not None and (done.target_return <= 0).all() and done.target_return.shape == (2,)
+    assert done.path.shape == (50, 2, 2) and seen[-1] == (2, "step 50")
     np.testing.assert_array_equal(done.timeout, ~done.success)
 
 
-def test_without_compilation(policy, monkeypatch):
-    one_step = lambda *args, chunk, **options: run_episodes(*args, chunk=1, **options)  # noqa: E731
-    monkeypatch.setattr("ct_jax.evaluate.run_episodes", one_step)
+def test_without_compilation(policy):
     maze = load_maze("antmaze-umaze")
     two = Pairs(np.float32([[6, 6]]), np.float32([[6.7, 6]]), np.float32([0.7]), 0)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=1)
     with jax.disable_jit():
-        done = evaluate(env, maze, two, "ct", policy=policy)
+        done = evaluate(MazeWorld(env, maze), two, "ct", policy=policy)
     assert done.steps.tolist() == [1]
     assert done.returns[0] == pytest.approx(-0.7, abs=0.1)
 
@@ -278,16 +275,20 @@ def test_any_policy_can_be_evaluated():
 
     @struct.dataclass
     class East:
-        def init(self, state):
-            return jnp.zeros(state.done.shape[0])
+        def init(self, frame, tasks):
+            return jnp.zeros(frame.done.shape[0])
 
-        def act(self, memory, state, key):
+        def act(self, memory, frame, key):
             return act_as_intended(jnp.tile(jnp.array([[1.0, 0.0]]), (len(memory), 1))), memory + 1
 
     two = Pairs(np.float32([[6, 6], [6, 6]]), np.float32([[12, 6], [6, 14]]), np.float32([6, 8]), 0)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=40)
-    done = evaluate(env, load_maze("antmaze-umaze"), two, "east", policy=East())
-    assert done.success.tolist() == [True, False] and done.collided.tolist() == [False, True] and done.asked is None
+    done = evaluate(MazeWorld(env, load_maze("antmaze-umaze")), two, "east", policy=East())
+    assert (
+        done.success.tolist() == [True, False]
+        and done.collided.tolist() == [False, True]
+        and done.target_return is None
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -298,7 +299,7 @@ def test_what_is_not_finite_is_counted_apart_and_paid_like_a_fall(faulty, bad):
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=20)
     n = len(fill_up(3, data_mesh()))
     policy = faulty(jnp.arange(n) % 3 == 1, bad)
-    done = evaluate(env, load_maze("antmaze-umaze"), three, "faulty", policy=policy)
+    done = evaluate(MazeWorld(env, load_maze("antmaze-umaze")), three, "faulty", policy=policy)
     assert done.diverged.tolist() == [False, True, False] and not done.fell.any()
     assert done.timeout.tolist() == [True, False, False] and done.success.tolist() == [False, False, True]
     assert done.steps.tolist() == [20, 4, 1]
@@ -311,9 +312,11 @@ def test_what_is_not_finite_is_counted_apart_and_paid_like_a_fall(faulty, bad):
 
 
 def test_pairs_of_another_maze_are_refused(pairs, push):
-    few = pairs["antmaze-large"]
+    few, world = pairs["antmaze-large"], MazeWorld(ENV, MAZES["antmaze-large"])
     for name, at in (("start", [2.0, 2.0]), ("goal", [np.nan, 6.0])):
         wrong = getattr(few, name).copy()
         wrong[3] = at
         with pytest.raises(UserError, match=rf"{name}\[3\]"):
-            evaluate(ENV, MAZES["antmaze-large"], replace(few, **{name: wrong}), "planner", controller=push())
+            evaluate(
+                MazeWorld(ENV, MAZES["antmaze-large"]), replace(few, **{name: wrong}), "planner", controller=push()
+            )

@@ -9,24 +9,28 @@ import pytest
 from flax import struct
 
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
-from ct_jax.collect import CollectConfig, draw_batch, make_guide, plan_memory
+from ct_jax.collect import CollectConfig
 from ct_jax.devices import data_mesh, fill_up
-from ct_jax.finetune import RecoverConfig, TakeoverPolicy, Watching, lie_for_ever, recover
+from ct_jax.finetune import RecoverConfig, TakeoverPolicy, lie_for_ever, recover
+from ct_jax.guided import Guided
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
-from ct_jax.rollout import Guided, act_as_intended
 from ct_jax.trajectories import PER_STEP
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
+from ct_jax.types import act_as_intended
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds.mazes import MazeWorld, as_frame, start_episodes
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
 N = 8
 PRM = PrmConfig(samples=60)
-COLLECTING = CollectConfig(reset_interval=4, envs=N, starts="maze")
+COLLECTING = CollectConfig(reset_interval=4, envs=N, starts="maze", horizon=190)
 CONFIG = RecoverConfig(recoveries=1, stuck_steps=5, stuck_m=1.0, patience=60, give_up=20.0)  # one wave
 MAZES = stack_mazes([load_maze("antmaze-umaze")])
-ENV = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=250)
+ENV = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False)
+WORLD = MazeWorld(ENV, MAZES)
+HORIZON = CONFIG.patience + COLLECTING.horizon
 
 
 @struct.dataclass
@@ -35,23 +39,23 @@ class Blind:
 
     controller: object
 
-    def init(self, state):
+    def init(self, frame, tasks):
         return ()
 
-    def act(self, memory, state, key):
-        return act_as_intended(self.controller(state.obs["proprio"], state.obs["goal"])), memory
+    def act(self, memory, frame, key):
+        return act_as_intended(self.controller(frame.obs.proprio, frame.obs.goal_relative)), memory
 
 
 def recoveries(own, push, seed=0, *, gain=1.0, **options):
     config = replace(CONFIG, **options)
-    return recover(jax.random.key(seed), ENV, MAZES, own, push(gain), config, COLLECTING, PRM)
+    return recover(jax.random.key(seed), WORLD, own, push(gain), config, COLLECTING, PRM)
 
 
 def test_rounds_recover_in_different_mazes(push):
     """Each of three rounds has two roadmaps; of five mazes they must between them see more than two."""
-    mazes = stack_mazes([make_maze(random_walls(seed, height=7, width=7)) for seed in range(5)])
+    world = MazeWorld(ENV, stack_mazes([make_maze(random_walls(seed, height=7, width=7)) for seed in range(5)]))
     config = replace(CONFIG, keep="relabelled", recoveries=1)
-    rounds = [recover(jax.random.key(i), ENV, mazes, Blind(push()), push(), config, COLLECTING, PRM) for i in range(3)]
+    rounds = [recover(jax.random.key(i), world, Blind(push()), push(), config, COLLECTING, PRM) for i in range(3)]
     assert len(set(np.concatenate([np.asarray(data.maze) for data in rounds]).tolist())) > 2
 
 
@@ -84,22 +88,22 @@ def test_the_planner_takes_over_where_the_policy_is_stuck(joined):
 
 
 def test_separate_recoveries_join_to_the_whole(joined, push):
-    pieces = recoveries(Blind(push()), push, keep="separate")
+    parts = recoveries(Blind(push()), push, keep="separate")
     n = joined.n
-    assert pieces.n == 2 * n
-    np.testing.assert_array_equal(pieces.length[:n] + pieces.length[n:], joined.length)
-    np.testing.assert_array_equal(pieces.length[:n], begins(joined))
+    assert parts.n == 2 * n
+    np.testing.assert_array_equal(parts.length[:n] + parts.length[n:], joined.length)
+    np.testing.assert_array_equal(parts.length[:n], begins(joined))
     for i in range(n):
-        begin, end = pieces.length[i], joined.length[i]
+        begin, end = parts.length[i], joined.length[i]
         for name in PER_STEP:
-            first, second = (getattr(pieces, name)[k, : pieces.length[k]] for k in (i, n + i))
+            first, second = (getattr(parts, name)[k, : parts.length[k]] for k in (i, n + i))
             if name == "label_mask":  # as trajectories of their own, both are imitated (paper)
                 assert first.all() and second.all()
                 continue
             np.testing.assert_array_equal(first, getattr(joined, name)[i, :begin], err_msg=name)
             np.testing.assert_array_equal(second, getattr(joined, name)[i, begin:end], err_msg=name)
-    np.testing.assert_array_equal(pieces.goal_world, np.tile(joined.goal_world, (2, 1)))
-    assert all(np.asarray(getattr(pieces, name)).dtype == np.float32 for name in PER_STEP)
+    np.testing.assert_array_equal(parts.goal_world, np.tile(joined.goal_world, (2, 1)))
+    assert all(np.asarray(getattr(parts, name)).dtype == np.float32 for name in PER_STEP)
 
 
 def test_a_policy_that_does_not_move_is_rescued_every_time(push):
@@ -117,27 +121,26 @@ def test_patience_ends(push):
 def test_the_planner_may_take_over_by_chance(push):
     data = recoveries(Blind(push(0.0)), push, keep="separate", takeover=1.0)
     assert data.n <= 2 * N and (data.label_mask.sum(1) == data.length).all()
-    assert (
-        len({tuple(goal) for goal in data.goal_world}) == data.n
-    )  # the failures before it have no steps: none is kept
+    assert len({tuple(goal) for goal in data.goal_world}) == data.n  # no failure has a step, so none is kept
 
 
 def supervised_walk(push, keep: str, steps: int = 12):
-    """Actions of a supervised policy beside those of the guide with the same memory."""
-    guide = make_guide("shortcut", ENV, PRM)
-    batch = draw_batch(jax.random.key(4), ENV, MAZES, COLLECTING, PRM)
-    plan = plan_memory(guide, batch.tables, batch.which, batch.state)
-    supervised = TakeoverPolicy(Blind(push(0.2)), Guided(push(), guide), replace(CONFIG, keep=keep))
-    memory = supervised.init(batch.state, (), supervised.guided.init(batch.state, plan))
+    """Actions of a takeover policy beside those of the guide with the same memory."""
+    tasks = WORLD.sample_tasks(jax.random.key(4), COLLECTING, PRM)
+    state, record = start_episodes(ENV, tasks.episode_keys, tasks.maze, tasks.start, tasks.goal), []
+    takeover = TakeoverPolicy(
+        Blind(push(0.2)), Guided(push(), WORLD.guide("shortcut", PRM)), replace(CONFIG, keep=keep)
+    )
+    memory = takeover.init(as_frame(state), tasks)
 
     @jax.jit
     def once(state, memory):
-        guided, _ = supervised.guided.act(memory.guided, state, jax.random.key(0))
-        own, _ = supervised.own.act((), state, jax.random.key(0))
-        action, after = supervised.act(memory, state, jax.random.key(0))
+        frame = as_frame(state)
+        guided, _ = takeover.guided.act(memory.guided, frame, jax.random.key(0))
+        own, _ = takeover.own.act((), frame, jax.random.key(0))
+        action, after = takeover.act(memory, frame, jax.random.key(0))
         return jax.vmap(ENV.step)(state, action.executed), after, (action, own, guided)
 
-    state, record = batch.state, []
     for _ in range(steps):
         state, memory, one = once(state, memory)
         record.append((*one, np.asarray(memory.rescued)))
@@ -186,16 +189,18 @@ def test_without_compilation(push):
         jax.jit(ValueNetwork(4).init)(jax.random.key(0), *inputs[:3]), config, 2, value_width=4,
     )  # fmt: skip
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False)
-    guide = make_guide("explorer", env, PRM)
-    batch = draw_batch(jax.random.key(0), env, MAZES, replace(COLLECTING, envs=2), PrmConfig(samples=20))
-    supervised = TakeoverPolicy(own, Guided(push(), guide, 0.1), replace(CONFIG, stuck_steps=1))
-    memory = supervised.init(batch.state, own.init(batch.state), supervised.guided.init(batch.state, guide.init(batch.state.info["maze"])))  # fmt: skip # noqa: E501
-    expected, _ = jax.jit(TakeoverPolicy.act)(supervised, memory, batch.state, jax.random.key(1))
+    world = MazeWorld(env, MAZES)
+    tasks = world.sample_tasks(jax.random.key(0), replace(COLLECTING, envs=2), PrmConfig(samples=20))
+    frame = as_frame(start_episodes(env, tasks.episode_keys, tasks.maze, tasks.start, tasks.goal))
+    guided = Guided(push(), world.guide("explorer", PRM), 0.1)
+    takeover = TakeoverPolicy(own, guided, replace(CONFIG, stuck_steps=1))
+    memory = takeover.init(frame, tasks)
+    expected, _ = jax.jit(TakeoverPolicy.act)(takeover, memory, frame, jax.random.key(1))
     with jax.disable_jit():
-        action, after = supervised.act(memory, batch.state, jax.random.key(1))
+        action, after = takeover.act(memory, frame, jax.random.key(1))
         assert not after.rescued.any()
     np.testing.assert_allclose(action.executed, expected.executed, atol=1e-4)
-    _, after = jax.jit(TakeoverPolicy.act)(supervised, after, batch.state, jax.random.key(2))
+    _, after = jax.jit(TakeoverPolicy.act)(takeover, after, frame, jax.random.key(2))
     assert after.rescued.all()
     assert jnp.isfinite(action.label).all()
 
@@ -209,14 +214,15 @@ def test_a_fall_is_paid_until_the_horizon(toy_data):
 
 
 def test_touching_walls_time_and_again_is_a_failure(push):
-    guide = make_guide("explorer", ENV, PRM)
-    supervised = TakeoverPolicy(
-        Blind(push()), Guided(push(), guide), replace(CONFIG, bumps=2, stuck_m=0.0, patience=99)
-    )
-    touched = jnp.zeros((CONFIG.stuck_steps, 3)).at[-2:, 1].set(1.0).at[0, 2].set(1.0)
-    past = jnp.full((CONFIG.stuck_steps, 3, 2), jnp.inf)
-    memory = Watching(None, None, past, touched, jnp.zeros((), jnp.int32), jnp.zeros(3, bool))
-    np.testing.assert_array_equal(supervised._failed(memory, jnp.zeros((3, 2))), [False, True, False])
+    """Of three robots one touched a wall twice just now, and one touched it once."""
+    config = replace(CONFIG, bumps=2, stuck_m=0.0, patience=99)
+    takeover = TakeoverPolicy(Blind(push()), Guided(push(), WORLD.guide("explorer", PRM)), config)
+    tasks = WORLD.sample_tasks(jax.random.key(0), replace(COLLECTING, envs=3), PRM)
+    frame = as_frame(start_episodes(ENV, tasks.episode_keys, tasks.maze, tasks.start, tasks.goal))
+    memory = takeover.init(frame, tasks)
+    memory = memory.replace(touched=memory.touched.at[-2:, 1].set(1.0).at[0, 2].set(1.0))
+    _, after = takeover.act(memory, frame, jax.random.key(0))
+    np.testing.assert_array_equal(after.rescued, [False, True, False])
 
 
 def test_a_fault_is_paid_like_a_fall_and_teaches_nothing_that_is_no_number(push, faulty):
@@ -229,6 +235,6 @@ def test_a_fault_is_paid_like_a_fall_and_teaches_nothing_that_is_no_number(push,
     away = np.linalg.norm(np.asarray(data.goal_world) - np.asarray(data.position)[:, 0], axis=-1)
     faults = np.asarray(data.length) == 4
     assert faults.sum() >= N - 1  # but for a start at the goal
-    np.testing.assert_allclose(np.asarray(data.rtg)[faults, 0], -ENV.horizon * away[faults], rtol=1e-3)
+    np.testing.assert_allclose(np.asarray(data.rtg)[faults, 0], -HORIZON * away[faults], rtol=1e-3)
     with pytest.raises(UserError, match="the robot falls before the planner takes over"):
         recoveries(own, push, keep="joined", recoveries=N)

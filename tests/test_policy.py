@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
-from ct_jax.collect import start_episodes
 from ct_jax.policy import TransformerPolicy
-from ct_jax.rollout import rollout
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds.mazes import as_frame, run, start_episodes
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -44,17 +43,17 @@ def walk(policy, state):
     def once(carry, key):
         state, memory = carry
         value = VALUE.apply(policy.value_params, *(state.obs[name] for name in ("map", "proprio", "goal")))
-        action, memory = policy.act(memory, state, key)
+        action, memory = policy.act(memory, as_frame(state), key)
         after = jax.vmap(ENV.step)(state, action.executed)
         return (after, memory), (memory.rtg, value, after.reward, action)
 
-    return jax.lax.scan(once, (state, policy.init(state)), jax.random.split(jax.random.key(0), STEPS))[1]
+    return jax.lax.scan(once, (state, policy.init(as_frame(state))), jax.random.split(jax.random.key(0), STEPS))[1]
 
 
 @pytest.mark.parametrize("k", [1.0, 0.7, 1.5])
 def test_the_return_asked_for_is_k_v_and_then_what_is_left_of_it(policy, start, k):
     rtg, value, reward, _ = map(np.asarray, jax.tree.leaves(walk(policy.replace(return_scale=k), start))[:4])
-    np.testing.assert_allclose(policy.replace(return_scale=k).init(start).rtg, k * value[0], rtol=1e-5)
+    np.testing.assert_allclose(policy.replace(return_scale=k).init(as_frame(start)).rtg, k * value[0], rtol=1e-5)
     np.testing.assert_allclose(rtg[0], k * value[0], rtol=1e-5)
     np.testing.assert_allclose(rtg[1:], rtg[:-1] - reward[:-1], rtol=1e-5)
     assert (rtg[1:] > rtg[:-1]).all()  # rewards are negative, so ever less is left
@@ -90,7 +89,7 @@ def test_a_policy_acts_on_a_window_as_its_settings_say(policy, start):
 
 def test_a_rollout_is_the_forward_pass_on_what_it_recorded(policy, start):
     """State, return and action tokens come from the episode as it went, in the order of training."""
-    _, memory, steps = rollout(ENV, policy, start, policy.init(start), jax.random.key(0), STEPS)
+    _, memory, steps = run(ENV, policy, start, policy.init(as_frame(start)), jax.random.key(0), STEPS)
     assert int(memory.past.now) == STEPS
     rtg = np.asarray(walk(policy, start)[0])
     mazes = start.info["maze"]
@@ -124,9 +123,9 @@ def test_behaviour_cloning_asks_for_nothing(policy, start):
 
 
 def test_without_compilation(policy, start):
-    memory = policy.init(start)
-    action, after = jax.jit(TransformerPolicy.act)(policy, memory, start, jax.random.key(0))
+    frame = as_frame(start)
+    action, after = jax.jit(TransformerPolicy.act)(policy, policy.init(frame), frame, jax.random.key(0))
     with jax.disable_jit():
-        plain, plain_after = policy.act(policy.init(start), start, jax.random.key(0))
+        plain, plain_after = policy.act(policy.init(frame), frame, jax.random.key(0))
     np.testing.assert_allclose(plain.executed, action.executed, atol=1e-5)
     np.testing.assert_allclose(plain_after.rtg, after.rtg, rtol=1e-5)

@@ -1,6 +1,7 @@
 """Roadmaps: their edges are the free ones, the table holds shortest paths, plans are free, guides arrive."""
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +16,20 @@ from ct_envs import UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_envs.maze import load_walls, parse_walls
 from ct_envs.turtlebot3 import RADIUS_M
 from ct_envs.turtlebot3_world import random_world
+from ct_jax.guides.roadmap import RoadmapGuide
 from ct_jax.prm import (
     NO_HOP,
     NoPath,
     Path,
+    PlanTable,
     PrmConfig,
-    RoadmapGuide,
     build_roadmap,
     draw_joined,
     extend,
     joins,
     stack_tables,
 )
+from ct_jax.types import Frame, Observation, Privileged
 
 RADIUS = 0.5
 SMALL = PrmConfig(samples=60, most_samples=60)
@@ -290,14 +293,27 @@ def test_there_is_no_path_from_or_to_a_wall(bad):
 # ----------------------------------------------------------------------------------------------------- guides
 
 
+def frame_of(maze, position, goal):
+    """Robots at positions [N, 2] (m)."""
+    n = len(position)
+    seen = Observation(None, jnp.zeros((n, 2)), goal - position)
+    return Frame(seen, jnp.zeros(n), jnp.zeros(n, bool), Privileged(position, goal, jnp.zeros(n), maze))
+
+
+class Plans(NamedTuple):
+    """Roadmaps, and which of them each robot follows."""
+
+    tables: PlanTable
+    table_of: jax.Array
+
+
 @functools.partial(jax.jit, static_argnames=("guide", "length"))
 def walk(guide, plan, maze, start, goal, key, noise, length):
     """Positions [T, N, 2] of dummies that move 0.3 m to where the guide says, and ``noise`` [m] anywhere."""
 
     def once(carry, key):
         position, plan = carry
-        target, plan = guide.waypoint(plan, maze, position, goal)
-        away = target - position
+        away, plan = guide.waypoint(plan, frame_of(maze, position, goal))
         far = jnp.linalg.norm(away, axis=-1, keepdims=True)
         position = position + away * jnp.minimum(1.0, 0.3 / jnp.maximum(far, 1e-6))
         return (position + noise * jax.random.normal(key, position.shape), plan), position
@@ -315,7 +331,7 @@ def guided(guide: RoadmapGuide, ends: np.ndarray, *, noise: float, length: int =
     start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
     maze = jax.tree.map(lambda leaf: leaf[WHICH], stack_mazes([load_maze(name) for name in NAMES]))
     tables = stack_tables([roadmap_of(name, PrmConfig()).table for name in NAMES])
-    plan = jax.jit(guide.init)(tables, jnp.asarray(WHICH), maze, start, goal)
+    plan = guide.init(frame_of(maze, start, goal), Plans(tables, jnp.asarray(WHICH)))
     return np.asarray(walk(guide, plan, maze, start, goal, jax.random.key(0), noise, length))
 
 
@@ -332,7 +348,7 @@ def test_a_table_of_some_goals_filled_up_to_a_larger_one_leads_as_the_whole_tabl
     start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
 
     def path(tables):
-        plan = guide.init(tables, jnp.zeros(2, jnp.int32), mazes, start, goal)
+        plan = guide.init(frame_of(mazes, start, goal), Plans(tables, jnp.zeros(2, jnp.int32)))
         return np.asarray(walk(guide, plan, mazes, start, goal, jax.random.key(0), 0.0, 200))
 
     np.testing.assert_array_equal(path(stack_tables([some, larger])), path(stack_tables([small.table])))

@@ -7,8 +7,12 @@ import pytest
 from flax import struct
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
-from ct_jax.collect import run_episodes, start_episodes
-from ct_jax.rollout import Guided, act_as_intended, broke_off, rollout
+from ct_envs.maze_env import broke_off
+from ct_jax.collect import CollectConfig
+from ct_jax.guided import Guided
+from ct_jax.prm import PrmConfig
+from ct_jax.types import act_as_intended
+from ct_jax.worlds.mazes import MazeWorld, as_frame, run, start_episodes
 
 N = 4
 ENV = MazeEnv("point", engine="mujoco", auto_reset=False, maps=False, horizon=9)
@@ -27,13 +31,21 @@ def start():
 class Straight:
     """A guide that points at the goal, and counts how often it was asked."""
 
-    def waypoint(self, memory, maze, position, goal):
-        return goal, memory + 1
+    def init(self, frame, tasks):
+        return jnp.zeros(())
+
+    def waypoint(self, memory, frame):
+        return frame.obs.goal_relative, memory + 1
+
+
+def roll(policy, start, steps=9):
+    """The last state and memory of a rollout, and its record."""
+    return run(ENV, policy, start, policy.init(as_frame(start), None), jax.random.key(0), steps)
 
 
 def test_what_is_recorded_is_what_happened(start, push):
     guided = Guided(push(), Straight())
-    state, (asked, _), steps = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)
+    state, (asked, _), steps = roll(guided, start)
     assert int(asked) == 9
     step, now = jax.jit(jax.vmap(ENV.step)), start
     for t in range(9):
@@ -50,7 +62,7 @@ def test_what_is_recorded_is_what_happened(start, push):
 
 def test_finished_episodes_stay_where_they_are(start, push):
     guided = Guided(push(), Straight())
-    _, _, steps = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)
+    _, _, steps = roll(guided, start)
     alive, position = np.asarray(steps.alive), np.asarray(steps.position)
     assert (np.diff(alive, axis=0) <= 0).all()
     for i, length in enumerate(alive.sum(0).astype(int)):
@@ -60,12 +72,14 @@ def test_finished_episodes_stay_where_they_are(start, push):
 
 def test_a_disturbance_is_done_but_not_meant(start, push):
     guided = Guided(push(), Straight(), 0.5)
-    memory, record = guided.init(start, jnp.zeros(())), []
+    frame = as_frame(start)
+    memory, record = guided.init(frame, None), []
+    intended = push()(frame.obs.proprio, frame.obs.goal_relative)
     act = jax.jit(Guided.act)
     for key in jax.random.split(jax.random.key(0), 200):
-        action, memory = act(guided, memory, start, key)
+        action, memory = act(guided, memory, frame, key)
         record.append(np.asarray(action.executed - action.intended))
-        np.testing.assert_array_equal(action.intended, guided.intend(jnp.zeros(()), start)[0])
+        np.testing.assert_allclose(action.intended, intended, atol=1e-6)
         np.testing.assert_array_equal(action.label, action.intended)
         np.testing.assert_array_equal(action.label_mask, 1.0)
     record = np.array(record)
@@ -77,25 +91,26 @@ def test_a_disturbance_is_done_but_not_meant(start, push):
 
 def test_without_noise_nothing_is_drawn(start, push):
     guided = Guided(push(), Straight())
-    memory = guided.init(start, jnp.zeros(()))
-    one, other = (guided.act(memory, start, jax.random.key(seed))[0] for seed in (0, 1))
+    memory = guided.init(as_frame(start), None)
+    one, other = (guided.act(memory, as_frame(start), jax.random.key(seed))[0] for seed in (0, 1))
     jax.tree.map(np.testing.assert_array_equal, one, other)
     np.testing.assert_array_equal(one.executed, one.intended)
 
 
-def test_episodes_run_in_chunks_until_all_are_over(start, push):
-    """Chunks change nothing but the end, which comes when nothing is left to run."""
-    guided = Guided(push(), Straight())
-    whole = rollout(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), 9)[2]
-    seen = []
-    _, _, steps = run_episodes(
-        ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), chunk=3, limit=99,
-        on_progress=lambda step, over: seen.append((step, over)),
-    )  # fmt: skip
-    assert [step for step, _ in seen] == [3, 6, 9] and seen[-1][1] == N
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), steps, whole)
-    _, _, cut = run_episodes(ENV, guided, start, guided.init(start, jnp.zeros(())), jax.random.key(0), chunk=3, limit=6)
-    assert len(cut.reward) == 6
+@pytest.mark.parametrize("horizon", [6, 60])
+def test_episodes_run_until_all_are_over_or_time_is(push, horizon):
+    """Each as it would run by itself; and progress tells how many are over."""
+    world = MazeWorld(ENV, load_maze("antmaze-umaze"))
+    tasks = world.sample_tasks(jax.random.key(1), CollectConfig(envs=N, starts="maze"), PrmConfig(samples=30))
+    guided, seen = Guided(push(), Straight()), []
+    rollout = world.rollout(guided, tasks, horizon=horizon, on_progress=lambda over, note: seen.append((over, note)))
+    state = start_episodes(ENV.with_horizon(horizon), tasks.episode_keys, tasks.maze, tasks.start, tasks.goal)
+    _, _, whole = run(ENV.with_horizon(horizon), guided, state, guided.init(as_frame(state), None), tasks.key, horizon)
+    n = len(rollout.steps.reward)
+    assert n <= horizon or n % 25 == 0
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:n], atol=1e-3), rollout.steps, whole)
+    assert [over for over, _ in seen] == sorted(over for over, _ in seen) and seen[-1][0] == N
+    assert (rollout.steps.alive.sum(0) <= horizon).all()
 
 
 def test_as_meant():
@@ -107,17 +122,16 @@ def test_as_meant():
 
 def test_without_compilation(start, push):
     guided = Guided(push(), Straight(), 0.3)
-    memory = guided.init(start, jnp.zeros(()))
-    compiled = rollout(ENV, guided, start, memory, jax.random.key(0), 2)[2]
+    compiled = roll(guided, start, 2)[2]
     with jax.disable_jit():
-        plain = rollout(ENV, guided, start, memory, jax.random.key(0), 2)[2]
+        plain = roll(guided, start, 2)[2]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plain, compiled)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_neither_recorded_nor_imitated(start, faulty, bad):
     which = jnp.array([False, False, True, False])
-    state, _, steps = rollout(ENV, faulty(which, bad), start, jnp.zeros((), jnp.int32), jax.random.key(0), 9)
+    state, _, steps = roll(faulty(which, bad), start)
     jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), steps)
     learn = np.asarray(steps.label_mask)
     assert not learn[3:, 2].any() and learn[:3].all() and learn[:, ~which].all()

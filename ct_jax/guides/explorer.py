@@ -44,7 +44,7 @@ class ExplorerGuide:
         maze, position, goal = frame.privileged.scene, frame.privileged.position, frame.privileged.goal_world
         seen = Seen(seen.cells | jax.vmap(self._shown)(maze, position))
         believed = maze.replace(walls=maze.walls & seen.cells)
-        to_go = _distances(believed, goal)
+        to_go = path_lengths(believed, goal)
         return jax.vmap(self._choose)(believed, to_go, position, goal) - position, seen
 
     def _shown(self, maze: Maze, position: jax.Array) -> jax.Array:
@@ -73,7 +73,7 @@ class ExplorerGuide:
         return points[jnp.argmin(jnp.where(usable, 0.999 * away + rest, jnp.inf))]
 
 
-def _distances(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
+def path_lengths(maze: Maze, goal: jax.Array) -> Float[Array, "N H W"]:
     """Path lengths [m] from cell centres to goals [N, 2] (m), over 4-connected free cells (value iteration)."""
     height, width = maze.shape
     cell = jax.vmap(cell_of)(maze, goal)

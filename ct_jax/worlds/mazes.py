@@ -193,7 +193,7 @@ class MazeWorld:
     ) -> Rollout:
         """Run all tasks side by side, in compiled chunks, until all episodes are over."""
         env, mesh = self.env.with_horizon(horizon), data_mesh()
-        state = start(env, tasks)
+        state = start_episodes(env, tasks.episode_keys, tasks.maze, tasks.start, tasks.goal)
         memory, parts = policy.init(as_frame(state), tasks), []
         chunk = min(_CHUNK, horizon)
         for i in range(-(-horizon // chunk)):
@@ -212,11 +212,14 @@ class MazeWorld:
         return Rollout(steps, end, last["goal"], own_rows(tasks.place), own_rows(tasks.counted), horizon)
 
 
-def start(env: MazeEnv, tasks: MazeTasks) -> State:
-    """The first states. The devices share them evenly, so N must be a length that ``fill_up`` gives."""
-    n = len(tasks.start)
-    episodes = Episodes(jnp.asarray(tasks.start)[:, None], jnp.asarray(tasks.goal)[:, None], jnp.ones(n, jnp.int32))
-    return _reset(env, *place((tasks.episode_keys, tasks.maze, episodes), sharded(data_mesh())))
+def start_episodes(env: MazeEnv, keys: jax.Array, maze: Maze, start: Any, goal: Any) -> State:
+    """First states of N episodes with the given keys [N], mazes (leading axis N), starts and goals [N, 2] (m).
+
+    The devices share them evenly, so N must be a length that ``fill_up`` gives.
+    """
+    start, goal = jnp.asarray(start)[:, None], jnp.asarray(goal)[:, None]
+    episodes = Episodes(start, goal, jnp.ones(len(start), jnp.int32))
+    return _reset(env, *place((keys, maze, episodes), sharded(data_mesh())))
 
 
 @functools.partial(jax.jit, static_argnums=0)
