@@ -8,20 +8,27 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ct_envs.errors import UserError
+    from ct_envs.generators import GENERATORS, generate_walls
     from ct_envs.maze import Maze, load_maze, make_maze, maze_names, random_walls, stack_mazes
     from ct_envs.maze_env import FlatObservation, MazeEnv, Tasks, check_tasks
+    from ct_envs.maze_statistics import measure_maze
     from ct_envs.robots import ANT, HUMANOID, POINT, ROBOTS, Robot
+    from ct_envs.unseen import test_maze, test_pairs, training_maze, validation_maze, validation_pairs
 
 __all__ = [
-    "ANT", "HUMANOID", "POINT", "ROBOTS", "FlatObservation", "Maze", "MazeEnv", "Robot", "Tasks", "UserError",
-    "check_tasks", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes",
+    "ANT", "GENERATORS", "HUMANOID", "POINT", "ROBOTS", "FlatObservation", "Maze", "MazeEnv", "Robot", "Tasks",
+    "UserError", "check_tasks", "generate_walls", "load_maze", "make_maze", "maze_names", "measure_maze",
+    "random_walls", "stack_mazes", "test_maze", "test_pairs", "training_maze", "validation_maze", "validation_pairs",
 ]  # fmt: skip
 
 _NAMES = {
     "errors": ("UserError",),
+    "generators": ("GENERATORS", "generate_walls"),
     "maze": ("Maze", "load_maze", "make_maze", "maze_names", "random_walls", "stack_mazes"),
     "maze_env": ("FlatObservation", "MazeEnv", "Tasks", "check_tasks"),
+    "maze_statistics": ("measure_maze",),
     "robots": ("ANT", "HUMANOID", "POINT", "ROBOTS", "Robot"),
+    "unseen": ("test_maze", "test_pairs", "training_maze", "validation_maze", "validation_pairs"),
 }
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 
