@@ -8,6 +8,7 @@ or any other ``Space``.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
 from typing import Annotated, Protocol
 
 import jax
@@ -23,6 +24,7 @@ from scipy.spatial import cKDTree
 from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, clearance, label_regions, segment_free, segment_reach, unpadded
+from ct_jax.files import whole
 
 _ALL_PAIRS = 2048  # points; the table of a larger roadmap holds the paths to its goals only, to save memory
 _JOINED_SHARE = 0.5  # without given ends, a roadmap is complete if it joins this share of the pairs of its own points
@@ -113,11 +115,16 @@ class Roadmap:
 
     @functools.cached_property
     def graph(self) -> nx.Graph:
-        """The roadmap as a networkx graph. Each edge has its length as ``weight`` [m]."""
+        """The roadmap as a networkx graph. Each node has ``x_m`` and ``y_m``, each edge its length as ``weight`` [m]."""
         graph = nx.Graph()
-        graph.add_nodes_from(range(len(self.points)))
+        graph.add_nodes_from((i, {"x_m": x, "y_m": y}) for i, (x, y) in enumerate(self.points.tolist()))
         graph.add_weighted_edges_from(zip(*self.edges.T.tolist(), self.length.tolist(), strict=True))
         return graph
+
+    def write_graph(self, file: FilePath) -> None:
+        """Write ``graph`` as GraphML, which networkx and graph viewers read. Raises UserError if that fails."""
+        with whole(file) as opened:
+            nx.write_graphml(self.graph, opened)
 
     @functools.cached_property
     def _weights(self) -> csr_array:

@@ -317,6 +317,4 @@ def test_pairs_of_another_maze_are_refused(pairs, push):
         wrong = getattr(few, name).copy()
         wrong[3] = at
         with pytest.raises(UserError, match=rf"{name}\[3\]"):
-            evaluate(
-                MazeWorld(ENV, MAZES["antmaze-large"]), replace(few, **{name: wrong}), "planner", controller=push()
-            )
+            evaluate(world, replace(few, **{name: wrong}), "planner", controller=push())

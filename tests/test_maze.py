@@ -179,7 +179,7 @@ def assert_one_line(call, *parts: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "line", "mend"),
+    ("content", "line", "hint"),
     [
         (b"####\n#.#\n####\n", ":2", "make all lines equal"),
         (b"####\n#..#\n#####\n", ":3", "make all lines equal"),

@@ -290,6 +290,19 @@ def test_there_is_no_path_from_or_to_a_wall(bad):
         assert f"the {name}" in answer.reason
 
 
+def test_the_graph_that_is_written_has_the_ways_of_the_table(tmp_path):
+    """Read by networkx alone, with the places of its nodes."""
+    roadmap = roadmap_of("antmaze-large")
+    roadmap.write_graph(tmp_path / "roadmap.graphml")
+    graph = nx.read_graphml(tmp_path / "roadmap.graphml", node_type=int)
+    places = np.array([[graph.nodes[i][name] for name in ("x_m", "y_m")] for i in range(len(roadmap.points))])
+    np.testing.assert_allclose(places, roadmap.points)
+    lengths = dict(nx.all_pairs_dijkstra_path_length(graph))
+    for i, column in enumerate(np.asarray(roadmap.table.goal).tolist()):
+        for node, distance in enumerate(np.asarray(roadmap.table.distance)[:, i].tolist()):
+            assert distance == pytest.approx(lengths[node].get(column, np.inf), rel=1e-5)
+
+
 # ----------------------------------------------------------------------------------------------------- guides
 
 

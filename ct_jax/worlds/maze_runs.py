@@ -81,6 +81,7 @@ def _roadmap(run: Run) -> Roadmap:
         with run.stage("prm") as (folder, info):
             file = folder / "roadmap.npz"
             devices.first(lambda: save_arrays(file, points=roadmap.points, edges=roadmap.edges))
+            devices.first(lambda: roadmap.write_graph(folder / "roadmap.graphml"))
             info |= {"points": len(roadmap.points), "edges": len(roadmap.edges)}
     return roadmap
 
