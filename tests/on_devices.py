@@ -21,14 +21,16 @@ from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
 from ct_jax import devices, interrupts
 from ct_jax.checkpoint import Checkpoints
 from ct_jax.collect import CollectConfig, collect
-from ct_jax.evaluate import Pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.fit import Fit, FitConfig, fit, init_params, spread, transformer_loss
 from ct_jax.interrupts import interruptible, raise_if_interrupted
+from ct_jax.pairs import Pairs
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
 from ct_jax.trajectories import Trajectories, load
 from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds.mazes import MazeWorld
 
 FOLDER, NAME = Path(sys.argv[1]), sys.argv[2]
 interrupts.GRACE_S = 120.0  # on a busy machine, to stop by itself takes longer than the system would wait
@@ -68,7 +70,7 @@ def empty(n: int, steps: int) -> Trajectories:
     shapes = {"position": 2, "proprio": 2, "action": 2, "label": 2, "reward": 0, "label_mask": 0, "collision": 0}
     arrays = {name: np.zeros((n, steps, size) if size else (n, steps), np.float32) for name, size in shapes.items()}
     counts = {name: np.zeros(n, np.int32) for name in ("maze", "length")}
-    return Trajectories(**arrays, **counts, goal=np.zeros((n, 2), np.float32))
+    return Trajectories(**arrays, **counts, goal_world=np.zeros((n, 2), np.float32))
 
 
 def train() -> dict[str, np.ndarray]:
@@ -113,17 +115,17 @@ def traffic() -> dict[str, np.ndarray]:
 
 def drive() -> dict[str, np.ndarray]:
     """Episodes collected, and episodes of a policy."""
-    env = MazeEnv("point", maps=False, auto_reset=False, horizon=COLLECT.horizon)
-    found = collect(jax.random.key(2), env, MAZES, Push(), COLLECT, PRM)
+    blind = MazeWorld(MazeEnv("point", maps=False, auto_reset=False), MAZE)
+    found = collect(jax.random.key(2), blind, Push(), COLLECT, PRM)
     collected = {name: devices.joined(np.asarray(getattr(found, name))) for name in ("length", "goal_world")}
     first_steps = devices.joined(np.asarray(found.position)[:, :2])
     value = ValueNetwork(8)
     value_params = init_params(jax.random.key(3), value, empty(1, 1))
     policy = TransformerPolicy(learner()[1], value_params, MODEL.config, 2, value_width=8)
-    env = MazeEnv("point", auto_reset=False, horizon=20)
+    world = MazeWorld(MazeEnv("point", auto_reset=False), MAZE)
     start = np.linspace([6.0, 6.0], [14.0, 6.0], 5, dtype=np.float32)
-    episodes = evaluate(env, MAZE, Pairs(start, start[::-1], np.ones(5), seed=0), "ct", policy=policy)
-    parts = ("success", "collided", "steps", "returns", "path", "asked")
+    episodes = evaluate(world, Pairs(start, start[::-1], np.ones(5), seed=0), "ct", policy=policy, horizon=20)
+    parts = ("success", "collided", "steps", "returns", "path", "target_return")
     evaluated = {f"evaluated-{part}": getattr(episodes, part) for part in parts}
     return {"collected": first_steps} | collected | evaluated
 

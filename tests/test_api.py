@@ -16,7 +16,7 @@ from flax import struct
 import ct_jax
 from ct_envs import MazeEnv, load_maze
 from ct_jax.cli import main
-from ct_jax.rollout import act_as_intended
+from ct_jax.types import act_as_intended
 
 SUBMODULES = sorted(f"ct_jax.{module.name}" for module in pkgutil.iter_modules(ct_jax.__path__))
 
@@ -97,11 +97,11 @@ class Witness:
     said: list = struct.field(pytree_node=False)
     action_size: int = struct.field(pytree_node=False, default=2)
 
-    def init(self, state):
-        return jnp.zeros(state.done.shape[0])
+    def init(self, frame, tasks=None):
+        return jnp.zeros(frame.done.shape[0])
 
-    def act(self, memory, state, key):
-        return act_as_intended(self(state.obs["proprio"], None)), memory
+    def act(self, memory, frame, key):
+        return act_as_intended(self(frame.obs.proprio, None)), memory
 
     def __call__(self, proprio, goal):
         one = jax.ShapeDtypeStruct((2, 2), jnp.float32)
@@ -109,10 +109,13 @@ class Witness:
         return jnp.zeros((len(proprio), 2))
 
 
+def a_world():
+    return ct_jax.MazeWorld(MazeEnv("point", engine="mujoco", auto_reset=False), load_maze("antmaze-umaze"))
+
+
 def evaluate(witness):
-    env, maze = MazeEnv("point", engine="mujoco", auto_reset=False, horizon=2), load_maze("antmaze-umaze")
-    pairs = ct_jax.draw_pairs(0, maze, 1, radius_m=0.5, tolerance_m=0.5)
-    ct_jax.evaluate_pairs(env, maze, pairs, "ct", policy=witness)
+    world = a_world()
+    ct_jax.evaluate_pairs(world, world.draw_pairs(0, 1), "ct", policy=witness, horizon=2)
 
 
 def act(witness):
@@ -121,18 +124,23 @@ def act(witness):
     agent.act(agent.init(seen), seen, np.zeros(1))
 
 
-def collect(witness):
-    from ct_envs import stack_mazes
+COLLECT = ct_jax.CollectConfig(trajectories=1, envs=1, horizon=2, give_up=1.0)
+PRM = ct_jax.PrmConfig(samples=20)
 
-    config = ct_jax.CollectConfig(trajectories=1, envs=1, horizon=2, give_up=1.0)
-    env = MazeEnv("point", engine="mujoco", auto_reset=False, horizon=2, maps=False)
-    mazes = stack_mazes([load_maze("antmaze-umaze")])
+
+def collect(witness):
     with contextlib.suppress(ct_jax.UserError):  # who stands still never arrives
-        ct_jax.collect_trajectories(jax.random.key(0), env, mazes, witness, config, ct_jax.PrmConfig(samples=20))
+        ct_jax.collect_trajectories(jax.random.key(0), a_world(), witness, COLLECT, PRM)
+
+
+def recover(witness):
+    config = ct_jax.RecoverConfig(recoveries=1, give_up=1.0)
+    with contextlib.suppress(ct_jax.UserError):  # likewise
+        ct_jax.recover(jax.random.key(0), a_world(), witness, witness, config, COLLECT, PRM)
 
 
 @pytest.mark.rank_promotion("allow")
-@pytest.mark.parametrize("entry", [evaluate, act, collect])
+@pytest.mark.parametrize("entry", [evaluate, act, collect, recover])
 def test_products_are_exact_in_what_is_compiled(entry):
     witness = Witness([])
     with jax.default_matmul_precision("bfloat16"):

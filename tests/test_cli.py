@@ -1,7 +1,6 @@
 """The command line as other tools rely on it: what it takes, what it prints, and one line for bad input."""
 
 import errno
-import functools
 import json
 import os
 import shutil
@@ -97,13 +96,12 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
 def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
     asked = []
 
-    @functools.wraps(pipeline._EVALUATIONS["maze"])
-    def listen(model, method, seed, keep, **options):
+    def listen(request, model, method, seed, keep):
         asked.append(model.policy.return_scale)
         keep(row := {"robot": model.robot})
         return row
 
-    monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listen)
+    monkeypatch.setattr(pipeline, "answer", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     rows = []
     for more in ([], ["--return_scale", "0.5"]):
@@ -249,7 +247,7 @@ def test_a_real_process_says_one_line_too():
 def test_an_output_that_cannot_be_written_is_told_before_the_work(
     option, tiny, tiny_run, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr("ct_jax.mazes.evaluate", lambda *_, **__: pytest.fail("it was evaluated"))
+    monkeypatch.setattr("ct_jax.pipeline.evaluate", lambda *_, **__: pytest.fail("it was evaluated"))
     ending = {"--picture": "png", "--video": "mp4"}[option]
     folder, file = tmp_path / f"folder.{ending}", tmp_path / "file"
     folder.mkdir()

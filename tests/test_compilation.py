@@ -15,9 +15,10 @@ import pytest
 from ct_envs import MazeEnv, load_maze
 from ct_envs.maze import sample_pair
 from ct_jax import compilation
-from ct_jax.evaluate import Pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.model import load_model
-from ct_jax.rollout import rollout
+from ct_jax.pairs import Pairs
+from ct_jax.worlds.mazes import MazeWorld, run
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -68,15 +69,18 @@ def test_the_same_training_again_compiles_nothing(fork, tiny_run, tiny_settings,
     assert first == second == there > 100
 
 
-def test_acting_compiles_once_for_mazes_of_a_size(tiny_run, islands):
-    model, env = load_model(str(tiny_run.folder)), MazeEnv("point", engine="mujoco", auto_reset=False, horizon=20)
-    before = rollout._cache_size()
-    for name in (str(islands), "antmaze-umaze", "antmaze-large"):
-        maze = load_maze(name)
-        draw = jax.vmap(lambda key, maze=maze: sample_pair(key, maze, radius=0.5))
-        start, goal = map(np.asarray, draw(jax.random.split(jax.random.key(0), 2)))
-        evaluate(env, maze, Pairs(start, goal, np.ones(2), 0), "ct", policy=model.policy)
-    assert rollout._cache_size() == before + 1
+def test_acting_compiles_once_for_mazes_of_a_size_and_a_horizon(tiny_run, islands):
+    """Of horizons each, too, whenever it comes again."""
+    model, env = load_model(str(tiny_run.folder)), MazeEnv("point", engine="mujoco", auto_reset=False)
+    before = run._cache_size()
+    for horizon, programs in ((20, 1), (30, 2), (20, 2)):
+        for name in (str(islands), "antmaze-umaze", "antmaze-large"):
+            maze = load_maze(name)
+            draw = jax.vmap(lambda key, maze=maze: sample_pair(key, maze, radius=0.5))
+            start, goal = map(np.asarray, draw(jax.random.split(jax.random.key(0), 2)))
+            pairs = Pairs(start, goal, np.ones(2), 0)
+            evaluate(MazeWorld(env, maze), pairs, "ct", policy=model.policy, horizon=horizon)
+        assert run._cache_size() == before + programs
 
 
 # ------------------------------------------------------------------------------------------------- the folder

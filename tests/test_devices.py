@@ -94,8 +94,8 @@ def test_no_device_is_sent_more_of_the_data_than_their_lengths(runs, name):
 
 def by_goal(run) -> tuple[np.ndarray, ...]:
     """Collected trajectories, in an order that does not depend on which process collected them."""
-    order = np.lexsort(run["goal"].T)
-    return tuple(run[name][order] for name in ("goal", "length", "collected"))
+    order = np.lexsort(run["goal_world"].T)
+    return tuple(run[name][order] for name in ("goal_world", "length", "collected"))
 
 
 @pytest.mark.parametrize("name", ["four", "two"])

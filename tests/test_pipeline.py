@@ -16,17 +16,18 @@ import numpy as np
 import pytest
 
 from ct_envs import UserError, load_maze, robots
-from ct_jax import mazes, pipeline
+from ct_jax import pipeline
 from ct_jax import run as runs
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
-from ct_jax.mazes import evaluated
 from ct_jax.model import load_model
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, load_mazes, maze_text, open_run, random_mazes
 from ct_jax.settings import Settings
+from ct_jax.worlds import Trial, kind_of, maze_runs
+from ct_jax.worlds.mazes import MazeWorld
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -155,9 +156,9 @@ def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, t
     settings = dataclasses.replace(tiny_settings, controller=str(source), controller_action_scale=0.5)
     run = make_run(tmp_path / "run", settings)
     with open_run(run, resume=False), contextlib.closing(Metrics(run.folder)) as metrics:
-        given, config = mazes.MazeCourse(run).controller(metrics)
+        given, config = kind_of(run.spec).controller(run, metrics)
         shutil.rmtree(source)
-        again, _ = mazes.MazeCourse(run).controller(metrics)
+        again, _ = kind_of(run.spec).controller(run, metrics)
     jax.tree.map(np.testing.assert_array_equal, given, again)
     done = run.done("controller")
     assert done is not None and done["given"] == str(source)
@@ -179,9 +180,9 @@ def test_the_random_mazes_are_always_the_same():
 def test_a_finished_run_is_not_run_again(tiny, tiny_run, tmp_path, monkeypatch):
     folder = copy(tiny_run, tmp_path)
     before = times(folder)
-    monkeypatch.setattr(pipeline, "fit", lambda *a, **k: pytest.fail("run again"))
-    for name in ("build_roadmap", "train_controller", "collect", "recover", "evaluate"):
-        monkeypatch.setattr(mazes, name, lambda *a, **k: pytest.fail("run again"))
+    stages = [(pipeline, name) for name in ("collect", "fit", "recover", "evaluate")]
+    for module, name in [*stages, (maze_runs, "build_roadmap"), (maze_runs, "train_controller")]:
+        monkeypatch.setattr(module, name, lambda *a, **k: pytest.fail("run again"))
     (folder / "report.html").unlink()
     assert main([*tiny_run.arguments, "--out", str(folder), "--resume"]) == 0
     assert times(folder) == before and (folder / "report.html").is_file()
@@ -308,7 +309,10 @@ def test_pairs_that_are_none_are_named(changes, tmp_path, tiny_settings):
     pairs = {"start": [[1, 2]], "goal": [[1, 2]], "shortest_m": [1]} | changes
     (tmp_path / "evaluate" / "pairs-antmaze-umaze-4-0.json").write_text(json.dumps(pairs))
     with pytest.raises(UserError, match=r"pairs-antmaze-umaze-4-0\.json: not an evaluation's pairs .*; delete it"):
-        evaluated(run, None, tmp_path / "evaluate", "antmaze-umaze", run.mazes["antmaze-umaze"], "ct", policy=None)
+        next(kind_of(run.spec).trials(run, tmp_path / "evaluate"))
+
+
+TRIAL = Trial("antmaze-umaze", None, None, {}, None, 1)  # pyright: ignore  # that nobody runs
 
 
 @pytest.mark.parametrize(
@@ -327,7 +331,7 @@ def test_rows_that_are_none_are_named(name, value, tiny_run, tmp_path, tiny_sett
     folder.mkdir()
     (folder / "antmaze-umaze-ct.json").write_text(json.dumps(row))
     with pytest.raises(UserError, match=r"antmaze-umaze-ct\.json: not a row"):
-        evaluated(run, None, folder, "antmaze-umaze", run.mazes["antmaze-umaze"], "ct", policy=None)
+        pipeline.evaluated(run, folder, TRIAL, "ct", policy=None)  # pyright: ignore
     for found in ({"rows": [*rows, row]}, {"rows": row}, {"rows": None}, {}):
         (folder / "results.json").write_text(json.dumps(found))
         with pytest.raises(UserError, match=r"results\.json: not the rows of a table; delete .*evaluate and continue"):
@@ -343,7 +347,7 @@ def test_trajectories_of_another_run_are_refused(changes, toy_data, tiny_run, ti
     data = data.replace(maze=data.maze + np.int32(changes.get("maze", 0)), **wider)
     storage.save(data, folder / "collect" / "trajectories.npz")
     with pytest.raises(UserError, match=r"trajectories\.npz: trajectories of another run; delete .*collect"):
-        pipeline.planning_trajectories(make_run(folder, tiny_settings), None, None)
+        pipeline.planning_trajectories(make_run(folder, tiny_settings), None)
 
 
 def test_a_config_without_its_provenance_is_named(tiny_run, tmp_path, tiny_settings):
@@ -440,8 +444,8 @@ def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, mon
 
     # What would take minutes op by op, and is tested elsewhere: planner and explorer, a roadmap of a thousand points,
     # and first parameters.
-    monkeypatch.setattr(mazes, "METHODS", ("ct",))
-    for module, name in ((mazes, "draw_pairs"), (pipeline, "init_params")):
+    monkeypatch.setattr(pipeline, "METHODS", ("ct",))
+    for module, name in ((MazeWorld, "draw_pairs"), (pipeline, "init_params")):
         monkeypatch.setattr(module, name, jax.disable_jit(False)(getattr(module, name)))
     run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))
     assert pipeline.train(run).is_file()

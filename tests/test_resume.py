@@ -18,7 +18,8 @@ import pytest
 
 from ct_jax import pipeline, presets
 from ct_jax.checkpoint import Checkpoints, run_to
-from ct_jax.fit import FitConfig
+from ct_jax.fit import FitConfig, ValueConfig
+from ct_jax.settings import RoomConfig
 
 pytestmark = pytest.mark.rank_promotion("allow")
 
@@ -32,7 +33,7 @@ OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scan
 def live(arguments, settings, folder, stage, operations, cache):
     """One life of a run: to its end, or so many file operations after the first in a stage's folder."""
     from ct_envs import robots
-    from ct_jax import checkpoint, cli, presets, settings
+    from ct_jax import checkpoint, cli, presets
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
     presets.PRESETS["tiny"] = presets.TURTLEBOT3_PRESETS["tiny"] = settings
@@ -133,14 +134,14 @@ def test_six_deaths_in_rooms(fork, tmp_path):
         presets.TURTLEBOT3_CPU,
         collect=replace(presets.TURTLEBOT3_CPU.collect, trajectories=6, envs=4, reset_interval=2),
         model=replace(presets.TURTLEBOT3_CPU.model, layers=1, heads=2, width=16),
-        value=settings.ValueConfig(fit=replace(fit, steps=1), width=16),
+        value=ValueConfig(fit=replace(fit, steps=1), width=16),
         fit=fit,
         rounds=2,
         round_fit=fit,
         last_fit=None,
         recover=replace(presets.TURTLEBOT3_CPU.recover, recoveries=2, patience=20, stuck_steps=15, stuck_m=0.1),
         episodes=2,
-        rooms=settings.RoomConfig(worlds=2),
+        rooms=RoomConfig(worlds=2),
     )
     arguments = ["train", "turtlebot3", "--preset", "tiny"]
     Killer(fork, arguments, settings, []).run(tmp_path / "whole", stages)

@@ -1,5 +1,6 @@
 """The Turtlebot3 end to end: the same command line and stages as in mazes, and what is its own."""
 
+import contextlib
 import importlib.util
 import json
 import sys
@@ -14,20 +15,18 @@ from flax import struct
 
 from ct_envs import UserError
 from ct_envs.turtlebot3 import Turtlebot3Config
-from ct_envs.turtlebot3_pool import Turtlebot3Pool
-from ct_jax import cli, mazes, pipeline, presets, rooms, settings
+from ct_jax import cli, pipeline, presets, settings
 from ct_jax.cli import main
-from ct_jax.collect import CollectConfig
-from ct_jax.collect_turtlebot3 import keeping
+from ct_jax.collect import CollectConfig, Wave, collect, kept_in
 from ct_jax.controllers.differential_drive import DifferentialDrive
-from ct_jax.evaluate import METHODS, Episodes
-from ct_jax.evaluate_turtlebot3 import PLANNER, draw_room_pairs, draw_rooms, evaluate_rooms, grades
-from ct_jax.finetune import RecoverConfig
-from ct_jax.finetune_turtlebot3 import recover
+from ct_jax.evaluate import METHODS, Episodes, evaluate
+from ct_jax.finetune import RecoverConfig, recover
 from ct_jax.fit import FitConfig
 from ct_jax.model import load_model
-from ct_jax.rollout import act_as_intended
 from ct_jax.trajectories import load, unpack_maps
+from ct_jax.types import act_as_intended
+from ct_jax.worlds.room_runs import SevenPairs, grades
+from ct_jax.worlds.rooms import PLANNER, RoomWorld, evaluation_rooms
 
 pytestmark = [
     pytest.mark.rank_promotion("allow"),
@@ -47,7 +46,7 @@ TINY = replace(
     last_fit=None,
     recover=RecoverConfig(recoveries=2, patience=20, stuck_steps=15, stuck_m=0.1, keep="relabelled"),
     episodes=2,
-    rooms=rooms.RoomConfig(worlds=2),
+    rooms=settings.RoomConfig(worlds=2),
 )
 
 
@@ -95,9 +94,8 @@ def test_what_was_seen_is_kept(trained):
 
 
 def test_a_finished_run_is_not_run_again(trained, monkeypatch):
-    monkeypatch.setattr(pipeline, "fit", lambda *a, **k: pytest.fail("run again"))
-    for name in ("collect", "recover", "evaluate_rooms"):
-        monkeypatch.setattr(rooms, name, lambda *a, **k: pytest.fail("run again"))
+    for name in ("collect", "fit", "recover", "evaluate"):
+        monkeypatch.setattr(pipeline, name, lambda *a, **k: pytest.fail("run again"))
     assert main([*trained.arguments, "--resume"]) == 0
 
 
@@ -146,35 +144,38 @@ def test_without_pybullet_training_is_one_line(trained, monkeypatch, capsys):
 
 
 def test_rooms_of_an_evaluation_depend_on_the_seed_alone_and_fill_up():
-    one, again, fuller, other = (draw_rooms(s, 3, density=d) for s, d in ((0, 1.0), (0, 1.0), (0, 2.0), (1, 1.0)))
+    one, again, fuller, other = (evaluation_rooms(s, 3, density=d) for s, d in ((0, 1.0), (0, 1.0), (0, 2.0), (1, 1.0)))
     for a, b, c, d in zip(one, again, fuller, other, strict=True):
         np.testing.assert_array_equal(a.boxes, b.boxes)
         assert c.covered() > a.covered() != d.covered()
-    pairs = draw_room_pairs(0, one, 4)
-    np.testing.assert_array_equal(pairs.world, np.repeat([0, 1, 2], 4))
+    pairs = RoomWorld(1, one).draw_pairs(0, 4)
+    np.testing.assert_array_equal(pairs.place, np.repeat([0, 1, 2], 4))
     straight = np.linalg.norm(pairs.goal - pairs.start, axis=1)
     assert (straight >= 1.0).all() and (pairs.shortest_m >= straight - 1e-5).all()
 
 
 def test_the_references_arrive_however_the_waves_are_cut():
-    worlds = draw_rooms(3, 2)
-    pairs = draw_room_pairs(3, worlds, 2)
-    with Turtlebot3Pool(3, processes=1) as pool:
-        cut = evaluate_rooms(pool, worlds, pairs, "planner")
-        explored = evaluate_rooms(pool, worlds, pairs, "explorer")
-    with Turtlebot3Pool(4, processes=1) as pool:
-        whole = evaluate_rooms(pool, worlds, pairs, "planner")
+    rooms, found = evaluation_rooms(3, 2), []
+    for slots, methods in ((3, ("planner", "explorer")), (4, ("planner",))):
+        with contextlib.closing(RoomWorld(slots, rooms, processes=1)) as world:
+            pairs = world.draw_pairs(3, 2)
+            found += [evaluate(world, pairs, m, controller=DifferentialDrive(), prm=PLANNER) for m in methods]
+    cut, explored, whole = found
     assert cut.success.all() and explored.success.all()
     np.testing.assert_array_equal(cut.steps, whole.steps)
+    np.testing.assert_allclose(cut.path[0], pairs.start, atol=1e-4)
+    assert cut.target_return is None and cut.not_joined == 0 and explored.not_joined is None
     assert (cut.travelled_m > 0.9 * (pairs.shortest_m - Turtlebot3Config().goal_tolerance_m)).all()
 
 
 def test_grades_count_as_the_paper_does():
     success, frontal, grazing = (np.array(x, bool) for x in ([1, 1, 1, 0, 0], [0, 0, 1, 0, 1], [0, 1, 1, 0, 0]))
     none = np.zeros(5)
+    rest = dict.fromkeys(("fell", "timeout", "steps", "returns", "travelled_m", "path"), none)
     episodes = Episodes(
-        success, frontal | grazing, none, none, none, none, none, none, None, 0.0, 400, frontal=frontal, grazing=grazing
-    )
+        success=success, collided=frontal | grazing, **rest, pairs=None, wall_s=0.0, horizon=400,
+        frontal=frontal, grazing=grazing,
+    )  # fmt: skip
     assert grades(episodes) == {"full": 1, "partial": 1, "failed": 3}
 
 
@@ -185,11 +186,11 @@ def test_grades_count_as_the_paper_does():
 class Ahead:
     """Full speed ahead, whatever comes: it gets stuck at the first wall."""
 
-    def init(self, state):
+    def init(self, frame, tasks=None):
         return jnp.zeros(())
 
-    def act(self, memory, state, key):
-        return act_as_intended(jnp.tile(jnp.array([1.0, 0.0]), (len(state.done), 1))), memory
+    def act(self, memory, frame, key):
+        return act_as_intended(jnp.tile(jnp.array([1.0, 0.0]), (len(frame.done), 1))), memory
 
 
 CONFIG = RecoverConfig(recoveries=1, stuck_steps=10, stuck_m=0.05, patience=150, keep="joined")
@@ -197,11 +198,11 @@ CONFIG = RecoverConfig(recoveries=1, stuck_steps=10, stuck_m=0.05, patience=150,
 
 @pytest.fixture(scope="module")
 def recoveries():
-    with Turtlebot3Pool(4, processes=1, config=Turtlebot3Config(horizon=550)) as pool:
+    with contextlib.closing(RoomWorld(4, processes=1)) as world:
 
         def run(**changes):
             config = replace(CONFIG, **changes)
-            return recover(jax.random.key(1), pool, Ahead(), config, COLLECT, PLANNER)  # pyright: ignore
+            return recover(jax.random.key(1), world, Ahead(), DifferentialDrive(), config, COLLECT, PLANNER)
 
         yield run
 
@@ -228,33 +229,58 @@ def test_relabelled_steps_are_all_told_what_the_planner_would_do(recoveries):
         assert np.abs(data.label[i, :length] - data.action[i, :length]).max() > 0.05
 
 
-def test_waves_are_driven_once_and_read_back(toy_data, tmp_path):
-    driven = []
+def test_waves_are_run_once_and_read_back(toy_data, tmp_path):
+    ran = []
 
     def wave(first):
-        driven.append(first)
-        if driven == [0, 50]:
+        ran.append(first)
+        if ran == [0, 50]:
             raise KeyboardInterrupt
-        return toy_data([3, 5], seed=first), np.array([True, False])
+        return Wave(toy_data([3, 5], seed=first), np.array([True, False]), np.array([False, first > 0]))
 
-    keep = keeping(tmp_path / "waves", kinds=1, hint="begin anew")(wave)
-    one, won = keep(0)
+    keep = kept_in(tmp_path / "waves", hint="begin anew")(wave)
+    one = keep(0)
     with pytest.raises(KeyboardInterrupt):
         keep(50)
-    again, won_again = keep(0)
-    keep(50)
-    assert driven == [0, 50, 50]
-    np.testing.assert_array_equal(won, won_again)
-    for name in ("position", "reward", "length"):
+    again = keep(0)
+    assert keep(50).broke_off.tolist() == [False, True]
+    assert ran == [0, 50, 50]
+    for name in ("success", "broke_off"):
+        assert getattr(again, name).dtype == bool
         np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
+    for name in ("position", "reward", "length"):
+        np.testing.assert_array_equal(getattr(one.data, name), getattr(again.data, name))
     (tmp_path / "waves" / "0.npz").write_bytes(b"half")
     with pytest.raises(UserError, match=r"0\.npz.*begin anew"):
         keep(0)
-    for flags in ("{}", '{"flags": 3}', '{"flags": [[true]]}', '{"flags": [[1, 0]]}', '{"flags": [[true, true]] }\n]'):
+    for flags in FLAGS:
         (tmp_path / "waves" / "50.json").write_text(flags)
         with pytest.raises(UserError, match=r"50\.json.*begin anew"):
             keep(50)
 
 
-def test_courses_are_there_for_every_robot():
-    assert {"maze": mazes.MazeCourse, "room": rooms.RoomCourse} == pipeline.COURSES
+FLAGS = (
+    "{}", '{"flags": 3}', '{"flags": [[true, true]]}', '{"flags": [[true], [true]]}', '{"flags": [[1, 0], [1, 0]]}',
+    '{"flags": [[true, true], 3]}', '{"flags": [[true, true], [true, true]] }\n]',
+)  # fmt: skip
+
+
+def test_a_collection_that_was_kept_is_read_back_whole(tmp_path):
+    """The world runs nothing again, and what is read back is what was collected."""
+    with contextlib.closing(RoomWorld(4, processes=1)) as world:
+        arguments = (jax.random.key(0), world, DifferentialDrive(), COLLECT, PLANNER)
+        one = collect(*arguments, keep=kept_in(tmp_path, hint=""))
+        world.close()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RoomWorld, "rollout", lambda *_, **__: pytest.fail("run again"))
+            again = collect(*arguments, keep=kept_in(tmp_path, hint=""))
+    jax.tree.map(np.testing.assert_array_equal, one, again)
+
+
+def test_the_seven_pairs_are_each_run_several_times():
+    with SevenPairs(repeats=2).open(load_model("zoo:turtlebot3")) as trial:
+        assert len(trial.pairs.start) == trial.head["episodes"] == 14 and trial.head["maze"] == "seven pairs"
+        np.testing.assert_array_equal(trial.pairs.start[::2], trial.pairs.start[1::2])
+        assert len(np.unique(trial.pairs.start, axis=0)) == 7
+        episodes = pipeline.measured(trial, "planner", policy=None, controller=DifferentialDrive())  # pyright: ignore
+        assert sum(grades(episodes).values()) == 14 and episodes.success.all()

@@ -1,9 +1,11 @@
 """The Turtlebot3: worlds are exact, the robot drives as its wheels turn and sees what is there, no process is lost."""
 
+import contextlib
 import functools
 import importlib.util
 import itertools
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -11,9 +13,9 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -27,25 +29,19 @@ from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, lidar_map
 from ct_envs.robots import ROBOTS
 from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_noise import Belief, Noise
-from ct_envs.turtlebot3_pool import _EMPTY, Episode, Frame, Turtlebot3Pool
+from ct_envs.turtlebot3_pool import _EMPTY, Episode, Turtlebot3Pool
+from ct_envs.turtlebot3_pool import Frame as PoolFrame
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, load_world, make_world, random_world, save_world
-from ct_jax.collect import CollectConfig
-from ct_jax.collect_turtlebot3 import (
-    Room,
-    ShortcutGuide,
-    clutter,
-    collect,
-    draw_wave,
-    drive_guided,
-    make_guide,
-    make_room,
-)
-from ct_jax.drive import to_trajectories
-from ct_jax.evaluate_turtlebot3 import as_state
-from ct_jax.explorer_turtlebot3 import Charted, ExplorerGuide
+from ct_jax.collect import CollectConfig, collect
+from ct_jax.controllers.differential_drive import DifferentialDrive
+from ct_jax.guided import Guided
+from ct_jax.guides.lidar_explorer import Charted, LidarExplorer
+from ct_jax.guides.room_roadmap import ShortcutGuide
 from ct_jax.prm import NoPath, PrmConfig, build_roadmap
 from ct_jax.prm import Path as Way
-from ct_jax.trajectories import unpack_maps
+from ct_jax.trajectories import to_trajectories, unpack_maps
+from ct_jax.types import Frame, Privileged
+from ct_jax.worlds.rooms import RoomWorld, as_frame, clutter, draw_ends, make_room
 
 SEEDS = st.integers(0, 2**31 - 1)
 DT_S = 0.2
@@ -241,9 +237,9 @@ def test_a_plan_through_a_wall_is_none():
     roadmap = build_roadmap(jax.random.key(0), fence, radius_m=RADIUS_M, config=PrmConfig(samples=60, connect_m=2.0))
     assert isinstance(roadmap.plan(np.array([1.0, 1.0]), np.array([1.0, 4.0])), NoPath)
     assert isinstance(roadmap.plan(np.array([1.0, 2.45]), np.array([1.0, 1.0])), NoPath)
-    alone = Room(fence, build_roadmap(jax.random.key(0), fence, radius_m=RADIUS_M, config=PrmConfig(2, 0.01)))
+    alone = build_roadmap(jax.random.key(0), fence, radius_m=RADIUS_M, config=PrmConfig(2, 0.01))
     with pytest.raises(UserError, match="joins no start and goal"):
-        alone.draw(np.random.default_rng(0))
+        draw_ends(fence, alone, np.random.default_rng(0))
 
 
 # --------------------------------------------------------------------------------------------- one simulation
@@ -681,61 +677,111 @@ SMALL = CollectConfig(trajectories=3, reset_interval=2, envs=3, horizon=400)
 PRM = PrmConfig(samples=150, connect_m=2.0, margin_m=0.08)
 
 
-@pytest.fixture(scope="module")
-def wave():
-    return draw_wave(jax.random.key(0), 0, SMALL, PRM, n=3)
+class Noting:
+    """A policy that keeps the frames it is shown."""
+
+    def __init__(self, policy):
+        self.policy, self.frames = policy, []
+
+    def init(self, frame, tasks):
+        return self.policy.init(frame, tasks)
+
+    def act(self, memory, frame, key):
+        self.frames.append(frame)
+        return self.policy.act(memory, frame, key)
 
 
 @pytest.fixture(scope="module")
-def drives(pool, wave):
-    return drive_guided(pool, wave, make_guide("roadmap", PRM))
+def rooms():
+    with contextlib.closing(RoomWorld(3, processes=2)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def wave(rooms):
+    return rooms.sample_tasks(jax.random.key(0), SMALL, PRM)
+
+
+@pytest.fixture(scope="module")
+def driven(rooms, wave):
+    """The record of three guided episodes, and the frames that the policy was shown."""
+    policy = Noting(Guided(DifferentialDrive(), rooms.guide("roadmap", PRM)))
+    return rooms.rollout(policy, wave, horizon=SMALL.horizon), policy.frames
+
+
+def one_by_one(rollout):
+    """The episodes of a rollout, each until its end; and all its positions, the last one too."""
+    path = np.concatenate([rollout.steps.position, rollout.end.position[None]])
+    for slot, length in enumerate(rollout.steps.alive.sum(0).astype(int)):
+        alive = type(rollout.steps)(*(None if leaf is None else leaf[:length, slot] for leaf in rollout.steps))
+        yield alive, path[: length + 1, slot]
 
 
 @bullet
-def test_drives_are_told_as_they_were(drives):
-    for each in drives:
-        away = np.linalg.norm(each.path[1:] - each.goal_world, axis=-1)
-        assert each.success and away[-1] < 0.2 and (away[:-1] >= 0.2).all() and each.length > 10
+def test_episodes_are_recorded_as_they_were(driven):
+    rollout, frames = driven
+    assert rollout.end.success.all() and rollout.counted.all() and (rollout.place == 0).all()
+    for slot, (each, path) in enumerate(one_by_one(rollout)):
+        goal, length = rollout.goal_world[slot], len(each.reward)
+        away = np.linalg.norm(path[1:] - goal, axis=-1)
+        assert away[-1] < 0.2 and (away[:-1] >= 0.2).all() and length > 10
+        assert each.success.tolist() == [0.0] * (length - 1) + [1.0] and (each.alive == 1).all()
         np.testing.assert_allclose(each.reward, -away - each.collision, atol=1e-3)
-        turn = np.exp(-1j * each.yaw_rad) * ((each.goal_world - each.position) @ [1, 1j])
+        np.testing.assert_array_equal(each.collision, np.maximum(each.frontal, each.grazing))
+        yaw_rad = np.array([frame.privileged.scene.yaw_rad[slot] for frame in frames[:length]])
+        turn = np.exp(-1j * yaw_rad) * ((goal - each.position) @ [1, 1j])
         np.testing.assert_allclose(each.goal_relative @ [1, 1j], turn, atol=1e-3)
         np.testing.assert_allclose(each.proprio @ [1, 1j], turn / np.abs(turn), atol=1e-3)
         held = np.abs(each.goal_relative).max(-1) < 0.99
-        np.testing.assert_array_equal(np.asarray(unpack_maps(each.map_bits))[held, 1].sum((1, 2)), 1)
+        maps = np.asarray(unpack_maps(each.map_bits))
+        np.testing.assert_array_equal(maps[held, 1].sum((1, 2)), 1)
+        np.testing.assert_array_equal(maps, [frame.obs.map[slot] for frame in frames[:length]])
         np.testing.assert_array_equal(each.action, each.label)
-        assert each.map_bits.shape == (each.length, 157) and (each.label_mask == 1).all()
+        assert each.map_bits.shape == (length, 157) and (each.label_mask == 1).all()
 
 
 @bullet
-def test_trajectories_are_the_drives(drives):
-    data = to_trajectories(drives)
+def test_trajectories_are_the_episodes(driven):
+    rollout, _ = driven
+    data = to_trajectories(rollout)
     assert data.n == 3
-    np.testing.assert_array_equal(data.length, [each.length for each in drives])
-    for i, each in enumerate(drives):
-        for name, kept in (("goal_relative", each.goal_relative), ("map_bits", each.map_bits), ("reward", each.reward)):
-            np.testing.assert_array_equal(getattr(data, name)[i, : each.length], kept)
-            assert not getattr(data, name)[i, each.length :].any()
-        np.testing.assert_array_equal(data.goal_world[i], each.goal_world)
+    np.testing.assert_array_equal(data.goal_world, rollout.goal_world)
+    for i, (each, _) in enumerate(one_by_one(rollout)):
+        length = data.length[i]
+        assert length == len(each.reward)
+        for name in ("position", "proprio", "action", "label", "reward", "collision", "goal_relative", "map_bits"):
+            np.testing.assert_array_equal(getattr(data, name)[i, :length], getattr(each, name))
+        assert not data.label_mask[i, length:].any() and not data.collision[i, length:].any()
 
 
 @bullet
-def test_the_key_decides_what_is_collected_and_only_successes_are(drives, pool):
+def test_the_key_decides_what_is_collected_and_only_successes_are(driven, rooms):
     told = []
-    data = collect(jax.random.key(0), pool, SMALL, PRM, on_progress=lambda won, of: told.append((won, of)))
+    data = collect(
+        jax.random.key(0), rooms, DifferentialDrive(), SMALL, PRM, on_progress=lambda won, of: told.append((won, of))
+    )
     assert told[-1][0] >= 3 and data.n == 3
-    for i, each in enumerate(drives):
-        np.testing.assert_array_equal(data.map_bits[i, : each.length], each.map_bits)
+    for i, (each, _) in enumerate(one_by_one(driven[0])):
+        np.testing.assert_array_equal(data.map_bits[i, : len(each.reward)], each.map_bits)
 
 
 @bullet
 @pytest.mark.parametrize(("guide", "noise"), [("shortcut", 0.5), ("explorer", 0.1)])
-def test_other_guides_arrive_too_and_a_disturbance_is_not_imitated(guide, noise, pool, wave):
-    drives = drive_guided(pool, wave, make_guide(guide, PRM), noise=noise)
-    assert all(each.success for each in drives)
-    for each in drives:
-        np.testing.assert_array_equal(each.action, each.label)
-    driven = np.linalg.norm(np.diff(drives[0].position, axis=0), axis=-1) / (0.22 * DT_S)
-    assert np.abs(driven - drives[0].action[:-1, 0]).max() > 0.4 * noise
+def test_other_guides_arrive_too_and_a_disturbance_is_not_imitated(guide, noise, rooms, wave):
+    policy = Guided(DifferentialDrive(), rooms.guide(guide, PRM), noise)
+    rollout = rooms.rollout(policy, wave, horizon=SMALL.horizon)
+    assert rollout.end.success.all()
+    np.testing.assert_array_equal(rollout.steps.action, rollout.steps.label)
+    each, path = next(one_by_one(rollout))
+    driven = np.linalg.norm(np.diff(path[:-1], axis=0), axis=-1) / (0.22 * DT_S)
+    assert np.abs(driven - each.action[:-1, 0]).max() > 0.4 * noise
+
+
+def unturned_frame(positions, **scene):
+    """What guides see of robots [n] at these positions [n, 2] (m), all of which head along x."""
+    n = len(positions)
+    scene = SimpleNamespace(yaw_rad=np.zeros(n), done=np.zeros(n, bool), **scene)
+    return Frame(None, np.zeros(n), scene.done, Privileged(positions, None, np.zeros(n), scene))  # pyright: ignore
 
 
 @given(SEEDS)
@@ -743,35 +789,67 @@ def test_other_guides_arrive_too_and_a_disturbance_is_not_imitated(guide, noise,
 def test_a_shortcut_is_in_sight_and_no_detour(seed):
     """From anywhere free, also right beside an obstacle: the straight way to the waypoint touches nothing."""
     rng = np.random.default_rng(seed)
-    room = make_room(jax.random.key(seed % 7), PRM)
-    start, goal = room.draw(rng, "maze")
+    room, roadmap = make_room(jax.random.key(seed % 7), PRM)
+    start, goal = draw_ends(room, roadmap, rng, "maze")
     guide = ShortcutGuide(0.08)
-    field = guide._field(Episode(room.world, start, goal), room)
+    memory = guide.init(
+        unturned_frame(start[None]), SimpleNamespace(goal=[goal], worlds=[room], roadmaps=[roadmap])
+    )  # fmt: skip
+    (field,) = memory
     assert np.isfinite(field.to_go).mean() > 0.9 and field.to_go[-1] == 0
-    for position in room.world.sample_free(rng, 20, RADIUS_M + 1e-3):
-        target = guide._choose(field, position)
-        assert room.world.segment_free(np.stack([position, target]), RADIUS_M - 2e-3) or (target == goal).all()
-    for index in rng.integers(len(field.points) - 1, size=10):  # at a waypoint, it goes on
-        position = field.points[index] + 0.02
-        target = guide._choose(field, position)
-        assert (target == goal).all() or np.linalg.norm(target - position) >= guide.waypoint_tolerance_m
+
+    def waypoints(positions):
+        return positions + guide.waypoint(memory * len(positions), unturned_frame(positions))[0]
+
+    free = room.sample_free(rng, 20, RADIUS_M + 1e-3)
+    for position, target in zip(free, waypoints(free), strict=True):
+        assert room.segment_free(np.stack([position, target]), RADIUS_M - 2e-3) or np.allclose(target, goal)
+    at = field.points[rng.integers(len(field.points) - 1, size=10)] + 0.02  # at a waypoint, it goes on
+    targets = waypoints(at)
+    far = np.linalg.norm(targets - at, axis=-1) >= guide.waypoint_tolerance_m - 1e-9
+    assert (far | np.isclose(targets, goal).all(-1)).all()
 
 
 @bullet
 def test_a_goal_never_reached_is_an_error_and_no_hang():
-    with Turtlebot3Pool(2, processes=1, config=Turtlebot3Config(horizon=3)) as short:
+    with contextlib.closing(RoomWorld(2, processes=1)) as short:
         config = CollectConfig(trajectories=1, envs=2, horizon=3, give_up=3.0)
         with pytest.raises(UserError, match="reached only 0 of 4 goals"):
-            collect(jax.random.key(0), short, config, PRM)
-        with pytest.raises(UserError, match="do not fit a pool"):
-            collect(jax.random.key(0), short, replace(config, horizon=400), PRM)
+            collect(jax.random.key(0), short, DifferentialDrive(), config, PRM)
+
+
+@bullet
+def test_a_world_runs_any_number_of_episodes_of_any_length(rooms, wave):
+    """More episodes than slots, and another horizon than before: nothing has to fit."""
+    policy = Guided(DifferentialDrive(), rooms.guide("roadmap", PRM))
+    whole = rooms.rollout(policy, wave, horizon=5)
+    assert whole.horizon == 5 and whole.steps.alive.sum(0).tolist() == [5.0] * 3 and not whole.end.success.any()
+    with contextlib.closing(RoomWorld(2, processes=1)) as small:
+        told = []
+        cut = small.rollout(policy, wave, horizon=5, on_progress=lambda over, note: told.append(over))
+    assert told == [2, 3]
+    jax.tree.map(np.testing.assert_array_equal, cut.steps, whole.steps)
+    jax.tree.map(np.testing.assert_array_equal, cut.end, whole.end)
+
+
+@bullet
+def test_a_closed_world_leaves_no_process(wave):
+    with contextlib.closing(RoomWorld(3, processes=1)) as world:
+        policy = Guided(DifferentialDrive(), world.guide("roadmap", PRM))
+        began = {child.pid for child in multiprocessing.active_children()}
+        for horizon in (2, 3):  # the processes of the first horizon go, too
+            world.rollout(policy, wave, horizon=horizon)
+            assert len({child.pid for child in multiprocessing.active_children()} - began) == 1
+    assert {child.pid for child in multiprocessing.active_children()} <= began
 
 
 def test_rooms_and_guides():
-    one, again, dense = (make_room(jax.random.key(3), PRM, densities=(d, d)) for d in (1.0, 1.0, 2.0))
-    np.testing.assert_array_equal(one.world.boxes, again.world.boxes)
-    np.testing.assert_array_equal(one.roadmap.points, again.roadmap.points)
-    assert dense.world.covered() > one.world.covered()
+    (one, roadmap), (again, same), (dense, _) = (
+        make_room(jax.random.key(3), PRM, densities=(d, d)) for d in (1.0, 1.0, 2.0)
+    )
+    np.testing.assert_array_equal(one.boxes, again.boxes)
+    np.testing.assert_array_equal(roadmap.points, same.points)
+    assert dense.covered() > one.covered()
     np.testing.assert_array_equal(clutter(5, 1.0).boxes, random_world(5).boxes)
 
 
@@ -780,8 +858,8 @@ def test_rooms_of_many_densities():
     for number in range(12):
         key = jax.random.key(number)
         drawn, sparse, dense = (
-            make_room(key, PRM, densities=d).world.covered() for d in ((0.5, 2), (0.5, 0.5), (2, 2))
-        )
+            make_room(key, PRM, densities=d)[0].covered() for d in ((0.5, 2), (0.5, 0.5), (2, 2))
+        )  # fmt: skip
         assert sparse - 0.01 <= drawn <= dense + 0.01  # to half an obstacle
         factors.append((drawn - sparse) / (dense - sparse))
     assert min(factors) < 0.3 and max(factors) > 0.7
@@ -798,9 +876,13 @@ def test_a_margin_keeps_the_explorer_away_where_there_is_room(seed):
     gap = n // 2 + seed % 5 - 2
     occupied[n // 2 + 8, gap - 2 : gap + 3] = False
     occupied[n // 2 + 8, gap + 6 : gap + 18 if wide else 0] = False
-    position, goal = np.array([0.0, 0.0]), np.array([0.0, 1.6])
+    position, goal = np.zeros((1, 2)), np.array([0.0, 1.6])
     chart = Charted(np.full(2, -7.0), goal, occupied)
-    bold, wary = (ExplorerGuide(RADIUS_M + 0.05, margin, look_m=5.0)._plan(chart, position) for margin in (0.0, 0.2))
+    nothing_met = {"ranges": np.full((1, LIDAR_BEAMS), LIDAR_RANGE_M), "believed_yaw_rad": np.zeros(1)}
+    frame = unturned_frame(position, believed_position=position, **nothing_met)
+    bold, wary = (
+        LidarExplorer(RADIUS_M + 0.05, margin, look_m=5.0).waypoint((chart,), frame)[0][0] for margin in (0.0, 0.2)
+    )
     if wide:
         assert wary[0] > bold[0] + 0.1
     else:
@@ -916,15 +998,15 @@ def test_a_pool_with_noise_is_its_simulations_one_by_one():
 def test_what_a_policy_is_told_has_nothing_of_the_truth():
     """Wherever the robot is in truth, and whatever it touches: what it acts on stays the same."""
     rng = np.random.default_rng(0)
-    frame = Frame(*(np.stack([leaf] * 2) for leaf in _EMPTY))
+    frame, goal = PoolFrame(*(np.stack([leaf] * 2) for leaf in _EMPTY)), np.ones((2, 2))
     other = frame._replace(
         position=rng.normal(size=(2, 2)), yaw_rad=rng.normal(size=2), reward=np.float32([-5, -9]),
         collision=np.ones(2, bool), frontal=np.ones(2, bool), grazing=np.ones(2, bool), success=np.ones(2, bool),
     )  # fmt: skip
-    one, same = as_state(frame), as_state(other)
+    one, same = as_frame(frame, goal), as_frame(other, goal + 1.0)
     np.testing.assert_array_equal(one.reward, same.reward)
     jax.tree.map(np.testing.assert_array_equal, one.obs, same.obs)
-    assert as_state(frame._replace(believed_reward=np.float32([-1, -2]))).reward.tolist() == [-1, -2]
+    assert as_frame(frame._replace(believed_reward=np.float32([-1, -2])), goal).reward.tolist() == [-1, -2]
 
 
 @pytest.mark.parametrize("level", [-0.1, 9.0, float("nan")])

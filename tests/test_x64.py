@@ -11,13 +11,14 @@ from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
 from ct_envs.robots import ANT
 from ct_jax.collect import CollectConfig, collect
 from ct_jax.controllers.sac import Sac, SacConfig, chain_tasks, split_edges
-from ct_jax.evaluate import draw_pairs, evaluate
+from ct_jax.evaluate import evaluate
 from ct_jax.finetune import RecoverConfig, recover
 from ct_jax.fit import Fit, FitConfig, fit, init_params, transformer_loss, value_loss
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig, build_roadmap
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds.mazes import MazeWorld
 
 pytestmark = pytest.mark.rank_promotion("allow")  # MJX and brax
 
@@ -73,15 +74,11 @@ def test_environments(both, robot, engine, auto_reset):
     assert_alike(*both(drive), atol=1e-3)
 
 
-def few(maze):
-    return draw_pairs(0, maze, 3, radius_m=POINT.radius_m, tolerance_m=POINT.goal_tolerance_m)
-
-
 def happened(maze, method, **who):
     """The episodes of a method in the first 60 steps, its pairs included."""
-    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=60)
-    done = evaluate(env, maze, few(maze), method, prm=PRM, **who)
-    names = ("success", "collided", "fell", "timeout", "steps", "returns", "travelled_m", "path", "asked")
+    world = MazeWorld(MazeEnv(POINT, engine="mujoco", auto_reset=False), maze)
+    done = evaluate(world, world.draw_pairs(0, 3), method, prm=PRM, horizon=60, **who)
+    names = ("success", "collided", "fell", "timeout", "steps", "returns", "travelled_m", "path", "target_return")
     pairs = (done.pairs.start, done.pairs.goal, np.asarray(done.pairs.shortest_m, np.float32))
     return {name: np.asarray(value, np.float32) for name in names if (value := getattr(done, name)) is not None}, pairs
 
@@ -144,16 +141,14 @@ def test_fit_updates(both, toy_data, kind):
 
 
 def test_collection_and_recoveries(both, push):
-    mazes = stack_mazes([load_maze("antmaze-umaze")] * 2)
-    env = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=200)
+    world = MazeWorld(MazeEnv(POINT, engine="mujoco", auto_reset=False), stack_mazes([load_maze("antmaze-umaze")] * 2))
     config = CollectConfig(trajectories=3, reset_interval=2, envs=4, horizon=200, noise=0.3)
     recovering = RecoverConfig(recoveries=1, stuck_steps=5, patience=10, takeover=0.1, keep="joined")
     policy = jax.device_get(transformer())
-    seeing = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=200)
 
     def gather():
-        collected = collect(jax.random.key(0), env, mazes, push(), config, PRM)
-        recovered = recover(jax.random.key(0), seeing, mazes, policy, push(), recovering, config, PRM)
+        collected = collect(jax.random.key(0), world, push(), config, PRM)
+        recovered = recover(jax.random.key(0), world, policy, push(), recovering, config, PRM)
         return [(data.length, data.goal_world, data.position[:, 0]) for data in (collected, recovered)]
 
     assert_alike(*both(gather), atol=1e-2)
