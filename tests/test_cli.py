@@ -106,7 +106,7 @@ def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
     monkeypatch.setitem(pipeline._EVALUATIONS, "maze", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     rows = []
-    for more in ([], ["--return_scale", "0.5"]):
+    for more in ([], ["--return-scale", "0.5"]):
         assert main([*command, *more]) == 0
         rows.append(json.loads(capsys.readouterr().out))
     assert asked == [Settings().return_scale, 0.5]
@@ -155,7 +155,7 @@ def test_version(capsys):
         (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
         (
             ["evaluate"],
-            ["RUN", "--maze", "--episodes", "--seed", "--method", "--return_scale", "--json", "zoo:point", "examples:"],
+            ["RUN", "--maze", "--episodes", "--seed", "--method", "--return-scale", "--json", "zoo:point", "examples:"],
         ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
@@ -219,9 +219,9 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
         (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
         (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
-        (["evaluate", "RUN", "--return_scale", "0"], ["--return_scale 0", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--return_scale", "nan"], ["--return_scale nan", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--return_scale", "0.5", "--method", "explorer"], ["--return_scale", "--method ct"]),
+        (["evaluate", "RUN", "--return-scale", "0"], ["--return-scale 0", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return-scale", "nan"], ["--return-scale nan", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return-scale", "0.5", "--method", "explorer"], ["--return-scale", "--method ct"]),
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "RUN", "--video", "walk.gif"], ["--video walk.gif", ".mp4"]),
@@ -269,7 +269,7 @@ def test_the_row_is_printed_before_anything_is_drawn(
         raise stop
 
     monkeypatch.setattr("ct_jax.report.pictures.write_paths", draw)
-    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--return_scale", "0.5"]
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--return-scale", "0.5"]
     assert main([*command, "--picture", str(tmp_path / "p.png"), *["--json"] * as_json]) == status
     out = capsys.readouterr().out
     if as_json:
@@ -486,8 +486,8 @@ def test_a_closed_pipe_is_no_error():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("--coordinator x:1", "go together"),
-        ("--processes 2 --process 0", "go together"),
+        ("--coordinator x:1", "belong together"),
+        ("--processes 2 --process 0", "belong together"),
         ("--coordinator x --processes 2 --process 0", "--coordinator x: give HOST:PORT"),
         ("--coordinator x:port --processes 2 --process 0", "--coordinator x:port: give HOST:PORT"),
         ("--coordinator x:1 --processes 2 --process 2", "--process 2: give a number from 0 to 1"),

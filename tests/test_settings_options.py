@@ -56,7 +56,7 @@ def test_without_changes_they_are_the_presets(settings_of):
     ("arguments", "says"),
     [
         (["--fit.updates", "-3"], "FitConfig.updates is -3"),
-        (["--fit.updates", "many"], "'many' is no whole number"),
+        (["--fit.updates", "many"], "'many' is not a whole number"),
         (["--fit.nonsense", "3"], "--fit.nonsense"),
         (["--model.frame", "sideways"], "sideways"),
         (["--model.heads", "3"], "multiple of heads"),
