@@ -192,7 +192,7 @@ def test_the_page_is_computed_from_what_was_measured(tmp_path):
     scale.main(options)
     page = options.page.read_text()
     assert "| point, collection guided by explorer | 10 trajectories/s | x86_64 CPU, 2 cores, commit 0 |" in page
-    assert page.count("| memory of a GPU |") == 3 and "## What breaks first" in page and "nan" not in page
+    assert page.count("| memory of a GPU |") == 3 and "## Limits and remedies" in page and "nan" not in page
 
 
 @pytest.mark.parametrize("robot", ["point", "ant"])

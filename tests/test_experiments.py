@@ -406,7 +406,7 @@ def test_the_page_says_what_made_each_row():
     rows = [a_row("cpu", 1, run_wall_s=600.0, collect_wall_s=60.0), a_row("cpu", 0, run_wall_s=1200.0)]
     rows += [a_row("cpu", 2, commit="def", run_wall_s=60.0), a_row("cpu", 0, "planner")]
     assert runs_table(rows, load_variants("point"))[2:] == [
-        "| `cpu` | 0, 1 | 15, of them 1.0 to collect | `python x.py` | abc | CPU | 2026-01-01 |",
+        "| `cpu` | 0, 1 | 15 (1.0 for collection) | `python x.py` | abc | CPU | 2026-01-01 |",
         "| `cpu` | 2 | 1 | `python x.py` | def | CPU | 2026-01-01 |",
         "| planner, explorer |  |  | `python x.py` | abc | CPU | 2026-01-01 |",
     ]
@@ -453,7 +453,7 @@ def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart()
 def test_only_fine_tuned_variants_are_compared_with_what_they_were():
     assert finetuned.before_of(finetuned.Options(robot="ant", tuned="skill")) == "skill-ct"
     assert finetuned.before_of(finetuned.Options(tuned="roam", longer=True)) == "long-ct"
-    with pytest.raises(UserError, match="--tuned cpu-ct: no fine-tuned variant; give one of f-ct, cpu, mazes"):
+    with pytest.raises(UserError, match="--tuned cpu-ct: not a fine-tuned variant; give one of f-ct, cpu, mazes"):
         finetuned.before_of(finetuned.Options(tuned="cpu-ct"))
 
 
