@@ -229,8 +229,8 @@ def test_random_mazes_are_mentioned(make_run, besides, said):
     config["settings"] |= {"random_mazes": besides, "recover": {"random_mazes": besides}}
     (run / "config.json").write_text(json.dumps(config))
     page = to_html(reading.read_run(run))
-    assert ("trained in 100 random mazes besides" in page) == said
-    assert ("looked for its failures in 100 random mazes" in page) == said
+    assert ("also trained in 100 random mazes" in page) == said
+    assert ("also collected in 100 random mazes" in page) == said
 
 
 def test_the_same_run_gives_the_same_page(make_run):
@@ -373,7 +373,7 @@ def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
         run.mkdir()
     if name in ("broken", "list"):
         (run / "config.json").write_text('{"robot": ' if name == "broken" else "[]")
-    with pytest.raises(UserError, match=r"config\.json|no folder") as error:
+    with pytest.raises(UserError, match=r"config\.json|not a folder") as error:
         write_report(run)
     assert str(run) in str(error.value) and "\n" not in str(error.value)
     assert run.is_file() or not (run / "report.html").exists()
