@@ -367,7 +367,7 @@ def check_task(world: World, start: np.ndarray, goal: np.ndarray) -> None:
             raise UserError(f"the {name} {point.tolist()} is not a point; give x and y in metres")
         if float(world.clearance(point)) < RADIUS_M:
             x, y = point
-            raise UserError(f"the {name} ({x:.2f}, {y:.2f}) is in an obstacle or wall, or too close to one; move it")
+            raise UserError(f"the {name} ({x:.2f}, {y:.2f}) is in an obstacle or wall, or too near to one; move it")
     if not world.reachable(start, goal, RADIUS_M):
         x, y = goal
         raise UserError(f"the goal ({x:.2f}, {y:.2f}) is out of the robot's reach from this start; move one of them")

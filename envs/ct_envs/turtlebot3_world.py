@@ -126,7 +126,7 @@ def make_world(boxes: Any = (), cylinders: Any = (), *, side_m: float = SIDE_M) 
         UserError: a number that is not finite, a size that is not positive, or an obstacle outside the room.
     """
     if not (np.isfinite(side_m) and 0.5 <= side_m <= 100.0):
-        raise UserError(f"the side of the room is {side_m} m; use 0.5 to 100 m")
+        raise UserError(f"the room has side {side_m} m; use 0.5 to 100 m")
     tables = {}
     for kind, fields, rows in (("boxes", _BOX, boxes), ("cylinders", _CYLINDER, cylinders)):
         table = np.asarray(rows, np.float64).reshape(-1, len(fields))
