@@ -43,21 +43,21 @@ def run_python(text: str) -> str:
     return done.stdout
 
 
-def test_no_public_name_is_that_of_a_submodule():
+def test_public_names_differ_from_submodules():
     assert not set(ct_jax.__all__) & {name.removeprefix("ct_jax.") for name in SUBMODULES}
 
 
 @pytest.mark.parametrize(("names_first", "modules"), [(True, SUBMODULES), (False, SUBMODULES[::-1])])
-def test_a_public_name_is_the_same_object_whatever_is_imported_first(names_first, modules):
+def test_public_name_does_not_depend_on_import_order(names_first, modules):
     run_python(SAME.format(names_first=names_first, modules=modules))
 
 
-def test_the_package_alone_imports_nothing_heavy():
+def test_import_of_package_is_light():
     said = run_python("import sys, ct_jax\nprint([m for m in ('jax', 'numpy', 'ct_envs') if m in sys.modules])")
     assert said.strip() == "[]"
 
 
-def test_every_name_is_listed_and_no_other_is_there():
+def test_all_lists_exactly_the_public_names():
     assert set(ct_jax.__all__) == set(ct_jax._SOURCE) <= set(dir(ct_jax))
     with pytest.raises(AttributeError, match="has no attribute 'unicorn'"):
         _ = ct_jax.unicorn  # pyright: ignore
@@ -74,7 +74,7 @@ def other_settings():
 
 
 @pytest.mark.rank_promotion("allow")
-def test_python_and_the_command_line_evaluate_alike(tiny_run):
+def test_python_and_command_line_evaluate_equally(tiny_run):
     """Bit for bit, whatever the caller's settings are; and these stay as they are."""
     folder, out = str(tiny_run.folder), io.StringIO()
     with contextlib.redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
@@ -133,7 +133,7 @@ def collect(witness):
 
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.parametrize("entry", [evaluate, act, collect])
-def test_products_are_exact_in_what_is_compiled(entry):
+def test_compiled_products_are_exact(entry):
     witness = Witness([])
     with jax.default_matmul_precision("bfloat16"):
         entry(witness)

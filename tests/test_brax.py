@@ -29,7 +29,7 @@ def keys(seed: int) -> jax.Array:
 
 @pytest.mark.parametrize("auto_reset", [True, False])
 @pytest.mark.parametrize(("horizon", "length"), [(8, 100), (100, 8)], ids=["its horizon", "brax's"])
-def test_after_a_reset_by_brax_goal_and_clock_are_those_of_the_first_episode(auto_reset, horizon, length):
+def test_reset_by_brax_restores_goal_and_steps(auto_reset, horizon, length):
     env = brax.envs.training.wrap(point(auto_reset=auto_reset, horizon=horizon), length, 1)
     step, state = jax.jit(env.step), jax.jit(env.reset)(keys(0))
     first, ends = state, []
@@ -52,7 +52,7 @@ def test_after_a_reset_by_brax_goal_and_clock_are_those_of_the_first_episode(aut
         assert len(each) >= 7 and (each == each[0]).all()
 
 
-def test_whoever_puts_in_another_pipeline_state_is_told_of_it():
+def test_info_follows_replaced_pipeline_state():
     env = point()
     reset, tasks = jax.jit(env.reset), Tasks(jnp.array([[6.0, 6.0]]), jnp.array([[14.0, 14.0]]), jnp.array(1))
     one, other = reset(jax.random.key(0), None, tasks), reset(jax.random.key(1))
@@ -63,7 +63,7 @@ def test_whoever_puts_in_another_pipeline_state_is_told_of_it():
 
 
 @pytest.mark.parametrize("maps", [False, True])
-def test_a_flat_observation_is_the_entries_of_the_dict(maps):
+def test_flat_observation_concatenates_the_dict(maps):
     env = point(maps=maps, auto_reset=False, horizon=3)
     flat = FlatObservation(env)
     assert flat.observation_size == 4 + maps * 2 * 25 * 25 and flat.action_size == 2

@@ -47,20 +47,20 @@ def refusal(build) -> str:
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_every_setting_says_what_it_may_be(config):
+def test_all_settings_have_ranges_or_choices(config):
     hints = get_type_hints(config, include_extras=True)
     assert hints.keys() == {field.name for field in fields(config)}
     loose = {f"{config.__name__}.{name}" for name, hint in hints.items() if unbounded(hint)}
     assert loose <= FREE_TEXT
 
 
-def test_a_loose_setting_is_found():
+def test_unbounded_setting_is_found():
     assert unbounded(int) == unbounded(tuple[int, ...]) == unbounded(int | None) == [int]
     assert not unbounded(Annotated[int, Within(1, 2)] | None)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_the_command_line_builds_every_config(config):
+def test_command_line_builds_all_configs(config):
     """tyro understands the annotations; what they forbid ends in its error box, not in a traceback."""
     assert tyro.cli(config, args=[]) == config()
     for name, hint in get_type_hints(config).items():
@@ -121,14 +121,14 @@ WRONG = [
 @pytest.mark.parametrize(
     ("config", "values", "words"), WRONG, ids=lambda value: value if isinstance(value, str) else "-"
 )
-def test_a_wrong_setting_is_one_line_that_says_what_to_give(config, values, words):
+def test_wrong_setting_is_error_of_one_line_with_allowed_values(config, values, words):
     """Whether it is built anew or made of another."""
     assert words in refusal(lambda: config(**values))
     assert words in refusal(lambda: replace(config(), **values))
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_configs_stay_static_arguments(config):
+def test_configs_are_static_arguments(config):
     assert hash(config()) == hash(config()) and config() == replace(config())
     traced = []
 
@@ -141,7 +141,7 @@ def test_configs_stay_static_arguments(config):
     assert len(traced) == 1
 
 
-def test_whole_numbers_are_numbers_too():
+def test_integers_are_accepted_as_floats():
     assert PrmConfig(connect_m=9) == PrmConfig(connect_m=9.0)
 
 
@@ -157,7 +157,7 @@ class Outer(Checked):
     other: Inner | None = None
 
 
-def test_json_comes_back_as_the_config_it_was():
+def test_json_round_trip_is_identity():
     for config in (Outer(), Outer(Inner(0.25, ()), Inner(1, (3,)))):
         assert from_json(Outer, dataclasses.asdict(config), "outer") == config
         lists = {"inner": {"share": config.inner.share, "sizes": list(config.inner.sizes)}}
@@ -178,11 +178,11 @@ def test_json_comes_back_as_the_config_it_was():
         ({"inner": {}, "other": {"share": "1"}}, "outer.other.share is '1'"),
     ],
 )
-def test_json_that_is_wrong_is_named_by_its_place(values, words):
+def test_wrong_json_is_error_with_its_path(values, words):
     assert words in refusal(lambda: from_json(Outer, values, "outer"))
 
 
-def test_settings_of_a_file_are_named_by_their_place():
+def test_wrong_settings_in_file_are_error_with_their_path():
     for name, value, words in (
         ("layers", "3", "settings.model.layers is '3'; give a whole number from 1 to 64"),
         ("heads", 3, "settings.model: ModelConfig.width is 128; give a multiple of heads, 3"),

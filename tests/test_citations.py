@@ -95,16 +95,16 @@ def wrong_citations(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("file", [*MODULES, *TESTS, *PAGES], ids=name_of)
-def test_what_is_cited_exists(file):
+def test_citations_exist_in_paper(file):
     assert not wrong_citations(file.read_text("utf-8"))
 
 
 @pytest.mark.parametrize("file", MODULES, ids=name_of)
-def test_a_module_cites_the_sections_of_its_topic(file):
+def test_module_cites_sections_of_its_topic(file):
     assert set(citations(file.read_text("utf-8"), "section")) <= TOPICS.get(topic_of(file), set())
 
 
-def test_every_topic_is_a_module():
+def test_all_topics_are_modules():
     assert TOPICS.keys() <= {topic_of(file) for file in MODULES}
     assert {section for allowed in TOPICS.values() for section in allowed} <= SECTIONS.keys()
 
@@ -124,5 +124,5 @@ def test_every_topic_is_a_module():
         ("(paper, sec. III-D and III-F, table II, figure 6, Algorithm 4; sec. IV)", []),
     ],
 )
-def test_a_wrong_citation_is_found(text, found):
+def test_wrong_citation_is_found(text, found):
     assert wrong_citations(text) == found

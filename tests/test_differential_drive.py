@@ -24,7 +24,7 @@ def move(position: np.ndarray, yaw: np.ndarray, action: np.ndarray) -> tuple[np.
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=3)
-def test_it_arrives_from_any_pose(controller, seed):
+def test_controller_reaches_goal_from_any_pose(controller, seed):
     rng = np.random.default_rng(seed)
     position, yaw = rng.uniform(-3, 3, (64, 2)), rng.uniform(-np.pi, np.pi, 64)
     yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal right behind
@@ -36,7 +36,7 @@ def test_it_arrives_from_any_pose(controller, seed):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=20)
-def test_it_stays_within_the_limits_and_never_backs(controller, seed):
+def test_controller_respects_limits_and_never_reverses(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(50, 2)) * 10.0 ** np.arange(-4, 1).repeat(10)[:, None]
     v, omega = speeds(controller(goals)).T
     assert (v >= 0).all() and v.max() <= TOP_SPEED_MPS and np.abs(omega).max() <= TOP_TURN_RADPS
@@ -44,7 +44,7 @@ def test_it_stays_within_the_limits_and_never_backs(controller, seed):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_it_is_proportional_below_saturation(seed):
+def test_controller_is_proportional_below_saturation(seed):
     """The paper's equations, without slowing in turns."""
     rng = np.random.default_rng(seed)
     distance, angle = rng.uniform(0, 0.2, 20), rng.uniform(-0.9, 0.9, 20)
@@ -57,19 +57,19 @@ def test_it_is_proportional_below_saturation(seed):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=20)
-def test_left_and_right_are_alike(controller, seed):
+def test_controller_is_mirror_symmetric(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(20, 2))
     np.testing.assert_allclose(controller(goals * [1, -1]), controller(goals) * [1, -1], atol=1e-12)
 
 
-def test_it_turns_before_it_drives():
+def test_controller_turns_before_driving():
     assert speeds(DifferentialDrive()(np.array([-1.0, 1.0]))).tolist() == [0.0, TOP_TURN_RADPS]
     assert DifferentialDrive()(np.zeros(2)).tolist() == [0.0, 0.0]
 
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_wheels_roll_as_the_robot_moves(seed):
+def test_wheel_speeds_match_motion_of_robot(seed):
     """The mean of the wheels' ways is the robot's, their difference its turn times the separation."""
     rng = np.random.default_rng(seed)
     v, omega = rng.uniform(-1, 1, (2, 30)) * [[TOP_SPEED_MPS], [TOP_TURN_RADPS]]

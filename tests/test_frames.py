@@ -34,7 +34,7 @@ def first_proprio(robot: Robot) -> jax.Array:
 
 
 @pytest.mark.parametrize(("robot", "size"), [(POINT, 8), (ANT, 32), (HUMANOID, 8)], ids=["point", "ant", "humanoid"])
-def test_a_symmetric_world_behaves_symmetrically(robot, size):
+def test_physics_is_symmetric(robot, size):
     group = symmetries(robot)
     assert len(group.world) == len(group.proprio) == len(group.action) == size
     np.testing.assert_array_equal(group.action[0], np.eye(group.action.shape[1]))
@@ -64,7 +64,7 @@ def test_symmetries_are_a_group(robot):
 
 
 @pytest.mark.parametrize(("robot", "size"), [(POINT, 1), (ANT, 4), (HUMANOID, 4)], ids=["point", "ant", "humanoid"])
-def test_turns_are_what_the_body_does_not_feel(robot, size):
+def test_turns_do_not_change_joints(robot, size):
     """Quarters of the world's circle; of the point, whose action is a vector of the world, none but nothing."""
     group = turns(symmetries(robot))
     angles = np.arctan2(group.world[:, 1, 0], group.world[:, 0, 0])
@@ -76,7 +76,7 @@ def test_turns_are_what_the_body_does_not_feel(robot, size):
         np.testing.assert_allclose(heading, transform(group.world, own_frame(proprio)[0]), atol=1e-5)
 
 
-def test_own_frame_does_not_see_the_world_turn():
+def test_own_frame_is_invariant_to_rotation():
     proprio = first_proprio(ANT)
     angle = 0.7
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -96,6 +96,6 @@ def test_own_frame_does_not_see_the_world_turn():
     np.testing.assert_allclose(own_frame(-proprio.at[5:].multiply(-1).at[0].multiply(-1))[1], own, atol=1e-5)  # -q is q
 
 
-def test_a_robot_without_known_symmetries_is_refused():
+def test_robot_without_symmetries_is_error():
     with pytest.raises(UserError, match="no known symmetries"):
         symmetries(Robot(**{**POINT.__dict__, "name": "stranger"}))

@@ -28,7 +28,7 @@ def fill(array: np.ndarray, pattern: str) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["zeros", "ones", "some", "ends"])
-def test_what_is_in_memory_stays_and_zeros_take_none(pattern):
+def test_contents_are_kept_and_zero_pages_are_returned(pattern):
     with zeros_given_back():
         array = np.empty(MEGABYTES * 2**20, np.uint8)
         fill(array, pattern)
@@ -42,7 +42,7 @@ def test_what_is_in_memory_stays_and_zeros_take_none(pattern):
     assert (array == 2).all()
 
 
-def test_what_was_there_before_is_left_alone():
+def test_earlier_memory_is_not_changed():
     array = np.empty(MEGABYTES * 2**20, np.uint8)
     array[:] = 0
     before = dirty_mb()

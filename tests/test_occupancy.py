@@ -49,7 +49,7 @@ def draw_pose(seed: int, walls: np.ndarray, cell_m: float) -> tuple[np.ndarray, 
 
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=40)
-def test_the_map_is_what_a_plain_loop_draws(walls, seed, cell_m):
+def test_map_equals_plain_loop(walls, seed, cell_m):
     position, goal = draw_pose(seed, walls, cell_m)
     picture = draw(make_maze(walls), position, goal, np.float32(cell_m))
     np.testing.assert_array_equal(picture, naive(walls, position, goal, cell_m))
@@ -57,7 +57,7 @@ def test_the_map_is_what_a_plain_loop_draws(walls, seed, cell_m):
 
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=40)
-def test_the_goal_is_one_cell_just_when_the_window_holds_it(walls, seed, cell_m):
+def test_goal_is_one_cell_if_inside_window(walls, seed, cell_m):
     position, goal = draw_pose(seed, walls, cell_m)
     channel = np.asarray(draw(make_maze(walls), position, goal, np.float32(cell_m)))[1]
     held = np.abs(goal - position).max() < MAP_CELLS * cell_m / 2
@@ -73,7 +73,7 @@ def test_the_goal_is_one_cell_just_when_the_window_holds_it(walls, seed, cell_m)
 @pytest.mark.parametrize("flip_x", [False, True])
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=10)
-def test_the_map_turns_with_the_world(flip_x, flip_y, transpose, walls, seed, cell_m):
+def test_map_is_equivariant(flip_x, flip_y, transpose, walls, seed, cell_m):
     """The 8 symmetries of the square: the map of the image is the image of the map."""
 
     def image(grid: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_the_map_turns_with_the_world(flip_x, flip_y, transpose, walls, seed, ce
 
 @given(WORLDS, SEEDS)
 @settings(max_examples=10)
-def test_the_number_of_cells_crops_the_window(walls, seed):
+def test_number_of_cells_crops_window(walls, seed):
     position, goal = draw_pose(seed, walls, 0.8)
     full = np.asarray(draw(make_maze(walls), position, goal, np.float32(0.8)))
     small = draw(make_maze(walls), position, goal, np.float32(0.8), cells=9)
@@ -102,7 +102,7 @@ def test_the_number_of_cells_crops_the_window(walls, seed):
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_the_cell_size_scales_the_window(seed):
+def test_cell_size_scales_window(seed):
     """A world twice as large through cells twice as large looks the same."""
     walls = random_walls(seed)
     position, goal = draw_pose(seed, walls, 0.8)
@@ -111,7 +111,7 @@ def test_the_cell_size_scales_the_window(seed):
     np.testing.assert_array_equal(one, two)
 
 
-def test_maps_are_small_arrays_of_zeros_and_ones():
+def test_maps_are_uint8_zeros_and_ones():
     picture = np.asarray(draw(load_maze("hall"), np.float32([6, 6]), np.float32([7, 7]), np.float32(0.8)))
     assert picture.shape == (2, MAP_CELLS, MAP_CELLS) == (2, 25, 25)
     assert picture.dtype == np.uint8
@@ -133,7 +133,7 @@ def draw_ranges(seed: int) -> np.ndarray:
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_a_lidar_marks_the_cells_its_beams_end_in_and_no_others(seed):
+def test_lidar_marks_exactly_the_end_cells_of_beams(seed):
     ranges = draw_ranges(seed)
     angle = np.radians(np.arange(LIDAR_BEAMS))
     expected = np.zeros((MAP_CELLS, MAP_CELLS), np.uint8)
@@ -147,7 +147,7 @@ def test_a_lidar_marks_the_cells_its_beams_end_in_and_no_others(seed):
 
 @given(SEEDS, st.integers(0, 3))
 @settings(max_examples=20)
-def test_the_lidar_map_turns_with_the_world(seed, quarters):
+def test_lidar_map_is_equivariant_to_rotation(seed, quarters):
     """Beams a quarter turn on, or a robot that has turned by one: the map is turned by one."""
     ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
     here = lidar_map(ranges, goal)
@@ -160,7 +160,7 @@ def test_the_lidar_map_turns_with_the_world(seed, quarters):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_left_and_right_of_a_lidar_are_mirrored(seed):
+def test_lidar_map_is_equivariant_to_reflection(seed):
     ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
     mirrored = lidar_map(np.roll(ranges[::-1], 1), goal * [1, -1])
     np.testing.assert_array_equal(mirrored, lidar_map(ranges, goal)[:, ::-1])
@@ -168,7 +168,7 @@ def test_left_and_right_of_a_lidar_are_mirrored(seed):
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_a_batch_of_lidars_is_one_after_the_other(seed):
+def test_batch_of_lidars_equals_single_ones(seed):
     ranges = np.stack([draw_ranges(seed + i) for i in range(6)]).reshape(2, 3, LIDAR_BEAMS)
     rng = np.random.default_rng(seed)
     goal, yaw = rng.uniform(-1.2, 1.2, (2, 3, 2)), rng.uniform(-3, 3, (2, 3))
@@ -180,7 +180,7 @@ def test_a_batch_of_lidars_is_one_after_the_other(seed):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_both_maps_put_the_goal_into_the_same_cell(seed):
+def test_both_maps_have_same_goal_cell(seed):
     goal = np.random.default_rng(seed).uniform(-1.2, 1.2, 2)
     halves = goal / LIDAR_CELL_M + 0.5
     assume(np.abs(halves - np.round(halves)).min() > 1e-3)
@@ -207,14 +207,14 @@ def with_beam(value: float) -> np.ndarray:
         (0.5, "no list of ranges"),
     ],
 )
-def test_a_lidar_that_is_wrong_is_one_line(ranges, words):
+def test_wrong_lidar_ranges_are_error_of_one_line(ranges, words):
     with pytest.raises(UserError, match=words) as caught:
         lidar_map(ranges, [1.0, 0.0])
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
-def test_a_beam_without_an_answer_may_be_allowed(value):
+def test_missing_beams_can_be_allowed(value):
     nothing = lidar_map(with_beam(1.0), [1.0, 0.0])
     np.testing.assert_array_equal(lidar_map(with_beam(value), [1.0, 0.0], missing_ok=True), nothing)
     with pytest.raises(UserError):

@@ -102,7 +102,7 @@ def test_engines_agree_in_free_space_and_at_walls(engine, wall_distance):
     # Ant: a slipping foot, or another contact point chosen where a capsule meets a box, is worth centimetres in a step.
     [(ANT, (4.75, 6.0), 0.3, 5e-2), pytest.param(HUMANOID, (6.0, 4.36), 0.2, 1e-3, marks=pytest.mark.slow)],
 )
-def test_engines_agree_about_walkers(robot, limb_at_wall, span, atol):
+def test_engines_agree_for_ant_and_humanoid(robot, limb_at_wall, span, atol):
     """MJX computes in float32, MuJoCo in float64: step by step from the same states, under small random torques. A
     contact that one engine lacks would be worth decimetres."""
     maze = load_maze("antmaze-umaze")
@@ -125,7 +125,7 @@ def test_engines_agree_about_walkers(robot, limb_at_wall, span, atol):
 
 
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])
-def test_a_step_is_pure(engine, wall_distance, name):
+def test_step_is_pure(engine, wall_distance, name):
     """Whatever was stepped before, and whoever is stepped beside it."""
     maze = make_maze(LARGE)
     state, other = (starts(seed, LARGE, wall_distance, speed=3.0) for seed in (1, 2))
@@ -155,7 +155,7 @@ def test_nested_vmap_is_one_flat_batch(engine, wall_distance):
 
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])
 @pytest.mark.parametrize("what", ["qpos", "qvel", "qacc_warmstart", "ctrl"])
-def test_a_nan_never_reaches_another_robot(engine, wall_distance, monkeypatch, tmp_path, name, what):
+def test_nan_does_not_spread_to_other_robots(engine, wall_distance, monkeypatch, tmp_path, name, what):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
     maze = make_maze(LARGE)
     state, ctrl = starts(4, LARGE, wall_distance, speed=3.0), pushes(4, 1)[0]
@@ -180,7 +180,7 @@ def test_engine_names(engine):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_control_step_is_the_robots(engine):
+def test_control_step_has_duration_of_robot(engine):
     for name in ("mjx", "mujoco"):
         seconds = engine(name).n_substeps * engine(name).model.opt.timestep
         assert seconds == pytest.approx(POINT.control_dt_s)
@@ -191,7 +191,7 @@ def test_a_control_step_is_the_robots(engine):
 
 @given(st.integers(0, 2**31 - 1), st.sampled_from([2.2, 4.0, 7.0]))
 @settings(max_examples=30)
-def test_no_wall_that_could_be_touched_is_missing(seed, cell_m):
+def test_boxes_cover_all_walls_within_reach(seed, cell_m):
     """Every wall within reach of a robot in a free cell is among the boxes, and every box is on a wall."""
     walls = random_walls(seed, height=12, width=12, density=0.6)
     maze = make_maze(walls, cell_m=cell_m)
@@ -212,7 +212,7 @@ def test_no_wall_that_could_be_touched_is_missing(seed, cell_m):
     assert (boxes[..., 2][boxes[..., 2] <= 0] < -100).all()
 
 
-def test_moved_boxes_equal_a_model_with_every_wall_built_in(engine, wall_distance):
+def test_moved_boxes_equal_model_with_all_walls(engine, wall_distance):
     """One step each from the same state, along random drives by the walls; and then the drives as a whole.
 
     A step differs by the rounding of its state to float32, 4e-6 m at 40 m. Drives part where a robot meets a
@@ -245,7 +245,7 @@ def test_moved_boxes_equal_a_model_with_every_wall_built_in(engine, wall_distanc
 
 
 @pytest.mark.parametrize("name", ["antmaze-large", "hall", "unseen-rooms"])
-def test_no_speed_carries_the_point_through_a_wall(engine, wall_distance, name):
+def test_point_never_passes_through_wall(engine, wall_distance, name):
     """Full throttle along both axes, from starts by the walls and at top speed: walls give by centimetres."""
     walls = load_walls(name)
     maze = load_maze(name)
@@ -261,7 +261,7 @@ def test_no_speed_carries_the_point_through_a_wall(engine, wall_distance, name):
         assert (wall_distance(walls, position[-1]) < 0.52).mean() > 0.5  # the walls were reached
 
 
-def test_cells_too_small_for_three_boxes_are_refused():
+def test_too_small_cells_are_error():
     for robot in (POINT, dataclasses.replace(POINT, touch_m=0.53), dataclasses.replace(POINT, top_speed_mps=9.1)):
         least = 2 * (robot.touch_m + robot.top_speed_mps * robot.control_dt_s)
         with pytest.raises(UserError) as refusal:
@@ -273,7 +273,7 @@ def test_cells_too_small_for_three_boxes_are_refused():
         build_model(robot, cell_m=enough)  # the mend is a mend
 
 
-def test_the_point_is_what_its_data_say():
+def test_model_of_point_matches_its_data():
     model = mujoco.MjModel.from_xml_string(model_xml(POINT))
     assert model.geom("ball").size[0] == POINT.radius_m == POINT.touch_m
     data = mujoco.MjData(model)

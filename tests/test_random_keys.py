@@ -19,7 +19,7 @@ SOURCES = sorted(
 _LOOKS = {"key_data", "len", "isinstance", "shape", "wrap_key_data", "sorted"}  # calls that use no randomness
 
 
-def test_folding_is_splitting():
+def test_fold_in_equals_split():
     """Why the rule is there."""
     key = jax.random.key(0)
     for i in range(3):
@@ -104,7 +104,7 @@ class _Uses(ast.NodeVisitor):
         ("return uniform(keys[0]), [draw(test_key), fold_in(test_key, 0)]", 1),
     ],
 )
-def test_the_rule_finds_what_it_should(body, wrong):
+def test_rule_finds_reused_keys(body, wrong):
     assert len(reuses(f"def f(key, test_key, state, a):\n {body}")) == wrong
 
 
@@ -116,6 +116,6 @@ _ON_PURPOSE = {
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
-def test_no_key_is_used_twice(file):
+def test_keys_are_used_once(file):
     found = reuses(file.read_text("utf-8"))
     assert [use for use in found if not any(f" {name} goes" in use for name in _ON_PURPOSE)] == []

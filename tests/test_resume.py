@@ -100,7 +100,7 @@ def assert_same_end(folder, whole):
     assert not [*folder.glob("*/checkpoints*"), *folder.glob("*/waves*"), *folder.glob("*/*.part")]
 
 
-def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, tmp_path):
+def test_killed_run_equals_uninterrupted_run(fork, tiny_run, tiny_settings, tmp_path):
     killer = Killer(fork, tiny_run.arguments, tiny_settings, [("controller", 60), ("collect", 4), ("finetune", 60)])
     killer.run(tmp_path / "run")
     assert killer.died_in == ["controller", "collect", "finetune"]
@@ -108,7 +108,7 @@ def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, 
 
 
 @pytest.mark.long
-def test_fourteen_deaths_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
+def test_fourteen_kills_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
     """Between two file operations, and by the clock: mostly while something is traced, compiled or computed."""
     deaths = [
         ("prm", 4), ("controller", 60), ("controller", 3.0), ("controller", 60), ("collect", 4), ("collect", 3.0),
@@ -125,7 +125,7 @@ def test_fourteen_deaths_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="PyBullet is not installed")
-def test_six_deaths_in_rooms(fork, tmp_path):
+def test_six_kills_in_rooms(fork, tmp_path):
     """With worker processes, which go when their pool is gone."""
     stages = ("collect", "fit", "finetune", "evaluate")
     fit = FitConfig(updates=6, batch=4, steps=5, warmup=2)
@@ -176,7 +176,7 @@ def train_for_ever(folder):
     )  # fmt: skip
 
 
-def test_sigterm_is_obeyed_in_time_in_the_middle_of_a_long_program(fork, tmp_path):
+def test_sigterm_during_long_program_saves_in_time(fork, tmp_path):
     """Python cannot even see the signal; what the last chunk left is saved all the same."""
     process = fork(train_for_ever, tmp_path)
     while not (tmp_path / "begun").exists():

@@ -118,7 +118,7 @@ def leaves(value):
 
 @given(mutated(json.loads(json.dumps(to_dict(SETTINGS)))))
 @examples(500)
-def test_settings_are_refused_or_sound(values):
+def test_mutated_settings_are_error_or_valid(values):
     """What is taken is finite and moderate, of the types of the defaults, and comes back as it is."""
     found = []
     if refused(lambda: found.append(from_dict(values))):
@@ -145,7 +145,7 @@ def test_settings_are_refused_or_sound(values):
     st.sampled_from(["point", "ant", "turtlebot3"]),
 )  # fmt: skip
 @examples(40)
-def test_what_is_taken_can_be_built(changes, robot):
+def test_accepted_settings_build_models(changes, robot):
     values = to_dict(SETTINGS)
     values["model"] |= changes
     refused(lambda: blank_model(robot, from_dict(values)))
@@ -189,7 +189,7 @@ def model_json(trained, tmp_path_factory):
 
 @given(data=st.data())
 @examples(500)
-def test_a_changed_description_is_refused_or_means_the_same(folder, model_json, trained, data):
+def test_mutated_model_description_is_error_or_equivalent(folder, model_json, trained, data):
     (folder / "model.json").write_text(json.dumps(data.draw(mutated(model_json))))
     found = []
     if not refused(lambda: found.append(load_model(str(folder)))):
@@ -198,7 +198,7 @@ def test_a_changed_description_is_refused_or_means_the_same(folder, model_json, 
 
 @given(data=st.data())
 @examples(400)
-def test_a_changed_description_of_a_controller_is_refused_or_means_the_same(folder, trained, data):
+def test_mutated_controller_description_is_error_or_equivalent(folder, trained, data):
     place = folder / "controller"
     save_controller(place, "point", SETTINGS.sac, trained.controller, {"seed": 0})
     described = json.loads((place / "controller.json").read_text())
@@ -214,7 +214,7 @@ def test_a_changed_description_of_a_controller_is_refused_or_means_the_same(fold
     st.integers(0, 3000), st.sampled_from(["[" * 100_000, '{"a":' * 100_000, "9" * 5000, "NaN", "-Infinity", "1e999"])
 )
 @examples(60)
-def test_json_that_cannot_be_read_is_one_line(folder, trained, where, what):
+def test_unreadable_json_is_error_of_one_line(folder, trained, where, what):
     save_model(folder, trained)
     text = (folder / "model.json").read_text()
     where = text.index(":", where % (len(text) - 10)) + 1
@@ -224,7 +224,7 @@ def test_json_that_cannot_be_read_is_one_line(folder, trained, where, what):
 
 @pytest.mark.parametrize("change", [{"heads": 1}, {"heads": 4}, {"stride": 2}, {"returns": False},
                                     {"context_acting": 4}, {"map_cell_m": 0.4}, {"commitment": 1.0}])  # fmt: skip
-def test_another_function_of_the_same_weights_is_refused(folder, trained, model_json, change):
+def test_changed_model_with_same_shapes_is_error(folder, trained, model_json, change):
     """Shapes do not tell these from what was saved."""
     save_model(folder, trained)
     settings = model_json["settings"]
@@ -235,7 +235,7 @@ def test_another_function_of_the_same_weights_is_refused(folder, trained, model_
             load_model(str(folder))
 
 
-def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
+def test_files_of_earlier_versions_are_read(folder, trained, model_json):
     """They bound weights to nothing, and said so by their format."""
     save_model(folder, trained)
     weights = folder / "weights.safetensors"
@@ -249,7 +249,7 @@ def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
 
 
 @pytest.mark.parametrize("number", [0, 4, 99, None, "2", 2.0, True])
-def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json, number):
+def test_unknown_format_is_error_with_known_formats(folder, trained, model_json, number):
     save_model(folder, trained)
     (folder / "model.json").write_text(json.dumps(model_json | {"format": number}))
     with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 to 3"):
@@ -257,7 +257,7 @@ def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json
 
 
 @pytest.mark.parametrize("name", zoo_names())
-def test_shipped_weights_are_bound_to_their_description(name, tmp_path):
+def test_shipped_weights_belong_to_their_description(name, tmp_path):
     place = model_folder("zoo:" + name)
     for file in place.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -286,7 +286,7 @@ def weights(tmp_path_factory):
 
 @given(data=st.data())
 @examples(400)
-def test_changed_bytes_are_refused_or_change_nothing(weights, data):
+def test_changed_bytes_are_error_or_have_no_effect(weights, data):
     file, whole = weights
     parts = bytearray(whole)
     for _ in range(data.draw(st.integers(1, 3))):
@@ -317,7 +317,7 @@ TYPES = [np.float64, np.float16, np.int8, np.int32, np.bool_, np.uint32, np.comp
 
 @given(data=st.data())
 @examples(200)
-def test_wrong_arrays_are_refused_though_their_sum_is_right(weights, data):
+def test_wrong_arrays_with_correct_sum_are_error(weights, data):
     """Of another type or shape, not finite, missing, or too many."""
     file, _ = weights
     arrays = dict(FLAT)
@@ -346,7 +346,7 @@ def test_wrong_arrays_are_refused_though_their_sum_is_right(weights, data):
     assert refused(lambda: load_weights(file, TREE))
 
 
-def test_refused_weights_say_what_was_found_and_what_is_needed(weights):
+def test_error_of_weights_shows_found_and_needed_shape(weights):
     file, _ = weights
 
     def refusal(arrays, **metadata):
@@ -366,13 +366,13 @@ def test_refused_weights_say_what_was_found_and_what_is_needed(weights):
 
 
 @pytest.mark.parametrize("kind", ["F8_E4M3", "F8_E8M0"])
-def test_types_that_numpy_has_not_are_refused(tmp_path, kind):
+def test_types_unknown_to_numpy_are_error(tmp_path, kind):
     header = json.dumps({"a": {"dtype": kind, "shape": [2, 3], "data_offsets": [0, 6]}}).encode()
     (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(6))
     assert refused(lambda: load_weights(tmp_path / "w.safetensors", TREE))
 
 
-def test_a_training_that_diverged_says_so_instead_of_saving(tmp_path):
+def test_diverged_weights_are_error_when_saved(tmp_path):
     with pytest.raises(UserError, match="'a' has become infinite or NaN in training; try a lower learning rate"):
         save_weights(tmp_path / "w.safetensors", {"a": np.float32([1.0, np.nan])})
     assert not list(tmp_path.iterdir())

@@ -34,7 +34,7 @@ def leaves(values: dict, path: str = ""):
         yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(path + name, value)]
 
 
-def test_settings_take_the_place_of_the_presets(settings_of):
+def test_options_override_preset(settings_of):
     plain = get_preset("demo", "ant")
     found = settings_of(
         "ant", "--preset", "demo", "--fit.updates", "500", "--model.width=256", "--collect.noise", "0.3",
@@ -48,7 +48,7 @@ def test_settings_take_the_place_of_the_presets(settings_of):
     assert json.loads(json.dumps(to_dict(found)))["fit"]["updates"] == 500
 
 
-def test_without_changes_they_are_the_presets(settings_of):
+def test_settings_without_options_equal_preset(settings_of):
     assert settings_of("point", "--preset", "cpu") == get_preset("cpu", "point")
 
 
@@ -64,14 +64,14 @@ def test_without_changes_they_are_the_presets(settings_of):
         (["--nonsense"], "--nonsense"),
     ],
 )
-def test_a_wrong_setting_is_one_line(capsys, tmp_path, arguments, says):
+def test_wrong_setting_is_error_of_one_line(capsys, tmp_path, arguments, says):
     assert cli.main(["train", "point", *arguments, "--out", str(tmp_path / "run")]) == cli.BAD_INPUT
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1 and says in error[0] and "--help-all" in error[0]
     assert not (tmp_path / "run").exists()
 
 
-def test_help_all_lists_every_setting(capsys):
+def test_help_all_lists_all_settings(capsys):
     assert cli.main(["train", "ant", "--preset", "cpu", "--help-all"]) == 0
     shown = capsys.readouterr().out
     for name, _ in leaves(dataclasses.asdict(dataclasses.replace(get_preset("cpu", "ant"), rooms=None))):

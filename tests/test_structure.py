@@ -98,23 +98,23 @@ def unpicklings(text: str, module: str = "") -> list[str]:
 # -------------------------------------------------------------------------------------------------- the rules
 
 
-def test_the_sources_were_found():
+def test_sources_are_found():
     assert {"ct_envs", "ct_envs.maze", "ct_jax", "ct_jax.prm", "ct_jax.controllers.sac"} <= set(PACKAGES)
 
 
 @pytest.mark.parametrize("module", PACKAGES)
-def test_packages_know_nothing_of_their_users(module):
+def test_packages_do_not_import_their_users(module):
     below = {"ct_jax"} if module.startswith("ct_envs") else set()
     assert not [name for name in imports_of(module) if within(name, USERS | below)]
 
 
 @pytest.mark.parametrize("module", sources("ct_envs"))
-def test_worlds_know_nothing_of_learning(module):
+def test_ct_envs_does_not_import_learning(module):
     assert not [name for name in imports_of(module) if within(name, LEARNING)]
 
 
 @pytest.mark.parametrize("module", sources("ct_jax"))
-def test_stages_import_earlier_ones_only(module):
+def test_stages_import_only_earlier_stages(module):
     stage = [*module.split("."), ""][1]
     assert not stage or stage in ORDER, f"give {stage} its place in ORDER"
     file = SHIPPED[module]
@@ -124,7 +124,7 @@ def test_stages_import_earlier_ones_only(module):
 
 
 @pytest.mark.parametrize("module", SHIPPED)
-def test_no_function_is_long(module):
+def test_functions_are_short(module):
     assert not long_functions(SHIPPED[module].read_text("utf-8"))
 
 
@@ -151,21 +151,21 @@ def test_nothing_is_unpickled(module):
         ("from .sac import Sac", "ct_jax.controllers.differential_drive", []),
     ],
 )
-def test_a_wrong_import_is_found(text, module, found):
+def test_wrong_import_is_found(text, module, found):
     assert later_stages(text, module) == found
 
 
-def test_what_only_type_checkers_read_is_no_import():
+def test_imports_for_type_checkers_are_ignored():
     text = "if TYPE_CHECKING:\n    import ct_jax.prm\nelse:\n    import ct_jax.fit\nif x:\n    import ct_jax.run"
     assert later_stages(at_import(text), "ct_jax") == ["ct_jax.fit", "ct_jax.run"]
 
 
-def test_relative_imports_of_a_package_start_at_itself():
+def test_relative_imports_start_at_package():
     assert list(imports("from .page import page", "ct_jax.report", package=True)) == ["ct_jax.report.page.page"]
     assert list(imports("from .page import page", "ct_jax.report.words")) == ["ct_jax.report.page.page"]
 
 
-def test_a_long_function_is_found():
+def test_long_function_is_found():
     body = "    x = 1\n"
     assert long_functions("def short():\n" + (LONGEST - 1) * body) == []
     assert long_functions("class A:\n  def long():\n" + LONGEST * body) == ["long"]
@@ -182,6 +182,6 @@ def test_a_long_function_is_found():
         "np.load(file, allow_pickle=flag)",
     ],
 )
-def test_an_unpickling_is_found(text):
+def test_unpickling_is_found(text):
     assert unpicklings(text)
     assert not unpicklings("import numpy as np\nnp.load(file, allow_pickle=False)")

@@ -59,7 +59,7 @@ def assert_alike(narrow, wide, *, atol: float = 1e-4) -> None:
 
 @pytest.mark.parametrize(("robot", "engine"), [(POINT, "mujoco"), (POINT, "mjx"), (ANT, "mujoco")])
 @pytest.mark.parametrize("auto_reset", [True, False])
-def test_environments(both, robot, engine, auto_reset):
+def test_environments_do_not_depend_on_x64(both, robot, engine, auto_reset):
     env = MazeEnv(robot, engine=engine, auto_reset=auto_reset, horizon=3)
     maze = load_maze("antmaze-umaze")
 
@@ -87,7 +87,7 @@ def happened(maze, method, **who):
 
 
 @pytest.mark.parametrize("method", ["planner", "explorer"])
-def test_guides(both, push, method):
+def test_guides_do_not_depend_on_x64(both, push, method):
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), method, controller=push())), atol=0.1)
 
 
@@ -103,13 +103,13 @@ def transformer(clip_target_return: bool = False) -> TransformerPolicy:
     )  # fmt: skip
 
 
-def test_the_transformer_acts(both):
+def test_transformer_does_not_depend_on_x64(both):
     policy = jax.device_get(transformer(clip_target_return=True))  # as a shipped model's: drawn without 64 bits
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), "ct", policy=policy)), atol=1e-2)
 
 
 @pytest.mark.parametrize("options", [{}, {"relabel": 0.5, "mirror": True, "chain": True, "turn_ramp": (0.2, 0.6)}])
-def test_sac_updates(both, options):
+def test_sac_does_not_depend_on_x64(both, options):
     """What is kept has the same types, and the random beginning is the same; brax's own draws differ afterwards."""
     config = SacConfig(envs=4, iterations=8, updates=1, warmup=2, batch=8, hidden=(8,), replay=64, episode_steps=4)
     robot = ANT if options else POINT
@@ -129,7 +129,7 @@ def test_sac_updates(both, options):
 
 
 @pytest.mark.parametrize("kind", ["transformer", "value"])
-def test_fit_updates(both, toy_data, kind):
+def test_fit_does_not_depend_on_x64(both, toy_data, kind):
     data = toy_data([9, 12], side_m=20.0)
     mazes = stack_mazes([load_maze("antmaze-umaze")])
     model = ControlTransformer(CONFIG, 2) if kind == "transformer" else ValueNetwork(4)
@@ -143,7 +143,7 @@ def test_fit_updates(both, toy_data, kind):
     assert_alike(*both(learn))
 
 
-def test_collection_and_recoveries(both, push):
+def test_collection_does_not_depend_on_x64(both, push):
     mazes = stack_mazes([load_maze("antmaze-umaze")] * 2)
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, maps=False, horizon=200)
     config = CollectConfig(trajectories=3, reset_interval=2, envs=4, horizon=200, noise=0.3)
