@@ -1,4 +1,4 @@
-"""A loaded policy acts on observations of one's own as it acts in an evaluation, and says what is wrong with them."""
+"""Agent: a loaded policy acts on given observations as in an evaluation, and wrong observations are errors."""
 
 import functools
 
@@ -24,7 +24,7 @@ def agent_of(robot):
 
 
 def observe(robot, n=N, seed=0):
-    """Observations that mean nothing, of the right shapes and types."""
+    """Random observations with the right shapes and types."""
     rng, proprio = np.random.default_rng(seed), sizes(robot)[0]
     return {
         "map": rng.integers(0, 2, (n, 2, 25, 25)).astype(np.uint8),
@@ -44,7 +44,7 @@ def act_along(agent, observations, rewards):
 
 @pytest.mark.rank_promotion("allow")
 def test_agent_acts_as_in_an_evaluation():
-    """On what the environment shows, the very actions that the rollout of an evaluation records."""
+    """For the observations of an evaluation, the actions equal the recorded ones."""
     model, agent = ct_jax.load("zoo:point"), agent_of("point")
     env = MazeEnv("point", engine="mujoco", auto_reset=False, map_cell_m=model.settings.model.map_cell_m)
     mazes = stack_mazes([load_maze("antmaze-umaze")] * N)

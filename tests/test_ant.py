@@ -1,4 +1,4 @@
-"""The ant: its body, its falls, its limbs at walls, and both engines moving it alike."""
+"""The ant: its body, falls, contacts of its limbs with walls, and the agreement of both engines."""
 
 import functools
 
@@ -36,7 +36,7 @@ def keys(seed: int, n: int = N) -> jax.Array:
 
 
 def lay(state, which, quat):
-    """The state with some of its robots turned to an attitude."""
+    """The state with some robots rotated to a given attitude."""
     physics = state.pipeline_state
     qpos = jnp.where(jnp.asarray(which)[:, None], physics.qpos.at[:, 3:7].set(jnp.array(quat)), physics.qpos)
     return state.replace(pipeline_state=physics.replace(qpos=qpos))

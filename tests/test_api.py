@@ -1,4 +1,4 @@
-"""``import ct_jax``: the public names, and the numerics that a caller's settings do not change."""
+"""``import ct_jax``: the public names, and results that do not depend on the caller's JAX settings."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ from ct_jax.rollout import act_as_intended
 
 SUBMODULES = sorted(f"ct_jax.{module.name}" for module in pkgutil.iter_modules(ct_jax.__path__))
 
-# Each public name is that of an object that stays the same, whatever is imported, in the given order.
+# Each public name is the same object for any order of imports.
 SAME = """
 import importlib, sys
 import ct_jax
@@ -37,7 +37,7 @@ for name, it in then.items():
 
 
 def run_python(text: str) -> str:
-    """What a process of its own prints."""
+    """The output of a separate process."""
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -68,14 +68,14 @@ def test_all_lists_exactly_the_public_names():
 
 @contextlib.contextmanager
 def other_settings():
-    """Settings of a program that has others than ours."""
+    """JAX settings that differ from ours."""
     with jax.default_matmul_precision("bfloat16"), jax.numpy_rank_promotion("raise"), jax.enable_x64(True):
         yield
 
 
 @pytest.mark.rank_promotion("allow")
 def test_python_and_command_line_evaluate_equally(tiny_run):
-    """Bit for bit, whatever the caller's settings are; and these stay as they are."""
+    """The rows are equal bit for bit for other JAX settings of the caller, and these settings do not change."""
     folder, out = str(tiny_run.folder), io.StringIO()
     with contextlib.redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
         patch.setattr("ct_jax.cli.prepare_jax", lambda *_: None)
@@ -92,7 +92,7 @@ def test_python_and_command_line_evaluate_equally(tiny_run):
 
 @struct.dataclass
 class Witness:
-    """A policy, or a controller, that keeps the text of a product that is compiled where it is."""
+    """A policy or controller that stores the text of a compiled product."""
 
     said: list = struct.field(pytree_node=False)
     action_size: int = struct.field(pytree_node=False, default=2)
@@ -127,7 +127,7 @@ def collect(witness):
     config = ct_jax.CollectConfig(trajectories=1, envs=1, horizon=2, give_up=1.0)
     env = MazeEnv("point", engine="mujoco", auto_reset=False, horizon=2, maps=False)
     mazes = stack_mazes([load_maze("antmaze-umaze")])
-    with contextlib.suppress(ct_jax.UserError):  # who stands still never arrives
+    with contextlib.suppress(ct_jax.UserError):  # a robot that does not move never reaches its goal
         ct_jax.collect_trajectories(jax.random.key(0), env, mazes, witness, config, ct_jax.PrmConfig(samples=20))
 
 

@@ -1,4 +1,4 @@
-"""The benchmarks' harness: contestants in turn, ratios pair by pair, results in files; and the dry run on paper."""
+"""The harness of the benchmarks: contestants in turn, ratios per round, results in files; and the scaling estimate."""
 
 import ast
 import itertools
@@ -26,7 +26,7 @@ BENCHMARKS = pathlib.Path(_harness.__file__).parent
 
 
 class Clock:
-    """Time that passes only where a contestant says so."""
+    """A clock that only contestants advance."""
 
     def __init__(self, monkeypatch):
         self.now, self.order = 0.0, []
@@ -70,7 +70,7 @@ def test_contestant_without_compilation_has_no_warm_up(monkeypatch):
 
 @pytest.mark.parametrize(("unit", "value", "other"), [("steps/s", 4.0, 1.0), ("ms", 250.0, 1000.0)])
 def test_ratio_is_relative_speed(tmp_path, monkeypatch, unit, value, other):
-    """Whatever is counted: for each unit of work, pair by pair."""
+    """For all units, per unit of work and per round."""
     clock = Clock(monkeypatch)
     race = results(tmp_path, monkeypatch, repeat=3, limit_s=60.0)
     ours, rival = clock.contestant("a", 1.0, 2.0, 1.0, 1.0, work=4.0), clock.contestant("b", 2.0, work=2.0)
@@ -81,7 +81,7 @@ def test_ratio_is_relative_speed(tmp_path, monkeypatch, unit, value, other):
 
 
 def test_results_are_written_to_one_file_only(tmp_path, monkeypatch, capsys):
-    """However often: the benchmark's source stays as it is."""
+    """The source of the benchmark does not change."""
     source = tmp_path / "it.py"
     source.write_text('"""What it does."""\n')
     for times in (1, 2):
@@ -116,7 +116,7 @@ def test_docstring_of_benchmark_has_its_command(file):
 
 
 def test_row_has_commit_from_start_of_make_bench(tmp_path, monkeypatch):
-    """The results that the benchmarks before it wrote are no change of the code."""
+    """Results of earlier benchmarks do not count as changes of the code."""
     monkeypatch.setenv(_harness.COMMIT, "as-it-was")
     race = results(tmp_path, monkeypatch)
     race.add("a step", "ms", [1.0])
@@ -138,7 +138,7 @@ def test_python_loop_builds_same_roadmap():
     table = prm_benchmark.loop_table(graph)
     expected, distance = np.asarray(roadmap.table.next_hop), np.asarray(roadmap.table.distance)
     for goal, hops in table.items():
-        for node, hop in hops.items():  # as short, if not the same: two ways may be
+        for node, hop in hops.items():  # the hop may differ if two paths have the same length
             assert hop == expected[node, goal] or np.isclose(
                 distance[node, hop] + distance[hop, goal], distance[node, goal], rtol=1e-5
             )
@@ -158,7 +158,7 @@ def test_python_loop_builds_same_roadmap():
 
 
 def scale_options(tmp_path, **rows: float) -> scale.ScaleOptions:
-    """Options whose results hold the named rows alone, as if of two cores."""
+    """Options with results that contain only the given rows, from a machine with two cores."""
     names = {
         "collected": ("rollout", "point, collection guided by explorer", "trajectories/s"),
         "roadmap": ("prm", "200 samples: build and table", "ms"),
@@ -197,7 +197,7 @@ def test_page_is_computed_from_measurements(tmp_path):
 
 @pytest.mark.parametrize("robot", ["point", "ant"])
 def test_measured_update_time_of_gpu_is_used(tmp_path, robot):
-    """Not another robot's, though: then a CPU's is taken."""
+    """A measurement of another robot is not used; then that of the CPU is."""
     options = scale_options(tmp_path, **MEASURED)
     made = {"hardware": "1 x NVIDIA, x86_64 CPU, 16 cores", "commit": "0"}
     rows = [
@@ -212,7 +212,7 @@ def test_measured_update_time_of_gpu_is_used(tmp_path, robot):
 
 
 def test_more_hosts_need_less_memory_and_more_communication(tmp_path):
-    """Memory, computation and roadmaps shrink as hosts grow, traffic does not."""
+    """Memory, computation and roadmaps shrink with the number of hosts; communication does not."""
     options = scale_options(tmp_path, **MEASURED)
     settings, assumed = scale.get_preset("paper", "point"), scale.Assumed()
     found = scale.measured(options, settings.prm.samples)

@@ -1,4 +1,4 @@
-"""``MazeEnv`` under brax's training wrappers and PPO: an episode that is begun anew is whole again."""
+"""``MazeEnv`` with brax's training wrappers and PPO: a restarted episode has its original goal and step count."""
 
 import functools
 
@@ -24,7 +24,7 @@ def point(*, maps=False, **options) -> MazeEnv:
 
 
 def keys(seed: int) -> jax.Array:
-    return jax.random.split(jax.random.PRNGKey(seed), N)  # brax's wrappers want keys of the old kind
+    return jax.random.split(jax.random.PRNGKey(seed), N)  # brax's wrappers need old-style keys
 
 
 @pytest.mark.parametrize("auto_reset", [True, False])
@@ -47,7 +47,7 @@ def test_reset_by_brax_restores_goal_and_steps(auto_reset, horizon, length):
         )
         assert all(jax.tree.leaves(same)), same
     lengths = [np.diff(np.flatnonzero(each), prepend=-1) for each in np.stack(ends).T]
-    assert max(map(max, lengths)) == 8  # some episode ends by time
+    assert max(map(max, lengths)) == 8  # some episodes reach the time limit
     for each in lengths:  # the same start, goal and actions: the same episode again
         assert len(each) >= 7 and (each == each[0]).all()
 
@@ -78,7 +78,7 @@ def test_flat_observation_concatenates_the_dict(maps):
 
 
 def test_ppo_trains(monkeypatch):
-    """brax's PPO asks for a function that jax has no more."""
+    """brax's PPO needs a function that was removed from jax."""
     copies = lambda tree, devices: jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)  # noqa: E731
     monkeypatch.setattr(jax, "device_put_replicated", copies, raising=False)
     small = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}

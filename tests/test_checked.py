@@ -1,4 +1,4 @@
-"""Every setting is checked where it is built: by Python, by the command line and from a file, and in one line."""
+"""Settings are checked when they are created: from Python, from the command line and from a file."""
 
 import dataclasses
 import functools
@@ -21,11 +21,11 @@ CONFIGS = [
     CollectConfig, CqlConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, RoomConfig, SacConfig, Settings,
     Turtlebot3Config, ValueConfig,
 ]  # fmt: skip
-FREE_TEXT = {"Settings.controller", "Turtlebot3Config.urdf"}  # folder and file
+FREE_TEXT = {"Settings.controller", "Turtlebot3Config.urdf"}  # names of a folder and a file
 
 
 def unbounded(hint) -> list[object]:
-    """Numbers without a range and texts without choices in an annotation."""
+    """The numbers without a range and the texts without choices in an annotation."""
     if get_origin(hint) is Annotated:
         base, *notes = get_args(hint)
         if any(isinstance(note, Within) for note in notes):
@@ -61,7 +61,7 @@ def test_unbounded_setting_is_found():
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_command_line_builds_all_configs(config):
-    """tyro understands the annotations; what they forbid ends in its error box, not in a traceback."""
+    """tyro accepts the annotations. A forbidden value gives an error of tyro, not a traceback."""
     assert tyro.cli(config, args=[]) == config()
     for name, hint in get_type_hints(config).items():
         if hint is int:
@@ -122,7 +122,7 @@ WRONG = [
     ("config", "values", "words"), WRONG, ids=lambda value: value if isinstance(value, str) else "-"
 )
 def test_wrong_setting_is_error_of_one_line_with_allowed_values(config, values, words):
-    """Whether it is built anew or made of another."""
+    """For a new config, and for ``dataclasses.replace``."""
     assert words in refusal(lambda: config(**values))
     assert words in refusal(lambda: replace(config(), **values))
 
@@ -198,5 +198,5 @@ def test_anything_can_be_shown():
         deep = [deep]
     for value in (deep, 10**5000, "x" * 1000, "a\nb", {"a": 10**5000}, float("nan")):
         assert len(shown(value)) <= 60 and shown(value).isprintable()
-    while deep:  # taken apart step by step: Python itself would go as deep
+    while deep:  # take it apart in steps: Python would recurse
         deep = deep.pop()

@@ -1,4 +1,4 @@
-"""What is kept on disk comes back as it was, or with an error that says which file and why."""
+"""Files on disk are restored exactly, or give an error with the file and the reason."""
 
 import errno
 import json
@@ -66,7 +66,7 @@ def test_newest_state_is_restored_and_old_ones_are_deleted(tmp_path):
     kept = Checkpoints(tmp_path / "states", keep=2)
     for step in (1, 2, 5):
         kept.save(step, state(step))
-    kept.save(5, state(9))  # is there already
+    kept.save(5, state(9))  # this step exists already
     step, found = kept.restore(state())
     kept.close()
     assert step == 5
@@ -86,7 +86,7 @@ def test_maybe_save_saves_at_intervals(tmp_path, monkeypatch):
 
 
 def saved(folder, *steps, size=1000):
-    """Checkpoints of these steps; each state holds its step many times."""
+    """Checkpoints of these steps. Each state contains its step number many times."""
     kept = Checkpoints(folder)
     for step in steps:
         kept.save(step, {"a": np.full(size, step, np.float32)})
@@ -94,7 +94,7 @@ def saved(folder, *steps, size=1000):
 
 
 def restored(folder, size=1000):
-    """The newest state that is whole, as (step, its numbers)."""
+    """The newest undamaged state, as (step, its numbers)."""
     kept = Checkpoints(folder)
     found = kept.restore({"a": np.zeros(size, np.float32)})
     kept.close()
@@ -116,7 +116,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_checkpoint_falls_back_to_previous(tmp_path, damage, capsys):
-    """Each file of the newest checkpoint in turn, the manifest too; one line says so, and training can go on."""
+    """Each file of the newest checkpoint is damaged in turn, also the manifest. One line reports it."""
     saved(tmp_path / "first", 1, 2)
     state = tmp_path / "first" / "2" / "default"
     manifest = (state / checkpoint.MANIFEST).read_text()
@@ -166,7 +166,7 @@ def test_manifest_has_format_of_sha256sum(tmp_path):
 
 @pytest.mark.parametrize("limit", [0, 300, 10_000, 100_000])
 def test_full_disk_keeps_earlier_checkpoints(tmp_path, limit):
-    """No file may grow beyond a limit: what the system then says is what it says of a full disk, but for the number."""
+    """A limit of the file size stands for a full disk. The system's error differs only in its number."""
     saved(tmp_path, 1)
     kept = Checkpoints(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -215,7 +215,7 @@ TREE = {
 
 
 def test_weights_round_trip_is_identity(tmp_path):
-    """Also in a structure of shapes only, transposed in memory, and single numbers."""
+    """Also for a structure that has only shapes, for arrays that are transposed in memory, and for scalars."""
     turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6, dtype=np.int32).reshape(2, 3).T}
     save_weights(tmp_path / "w.safetensors", turned)
     assert_same(load_weights(tmp_path / "w.safetensors", turned), turned)
@@ -257,7 +257,7 @@ def test_damaged_weights_are_error(tmp_path, damage):
 
 
 class Trap:
-    """Writes a file when it is unpickled."""
+    """An object that writes a file when it is unpickled."""
 
     def __init__(self, file):
         self.file = file
@@ -273,7 +273,7 @@ def test_json_file_round_trip_is_identity(tmp_path):
     value = {"a": [1, 2.5, None, "ä"], "b": {"c": True}}
     write_json(tmp_path / "x.json", value)
     assert read_json(tmp_path / "x.json") == value
-    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]  # nothing half-written is left
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]  # no unfinished file remains
 
 
 def test_failed_write_keeps_old_file(tmp_path):

@@ -1,4 +1,4 @@
-"""Citations of the paper: sections, tables, algorithms and figures that are cited exist, and fit the citing module."""
+"""Citations of the paper: cited sections, tables, algorithms and figures exist, and fit the module that cites them."""
 
 import re
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ SECTIONS = {
 TABLES = {"I": "hyperparameters", "II": "results in mazes"}
 ALGORITHMS = {"1": "the whole method", "2": "controller", "3": "collection", "4": "recoveries"}
 FIGURES = {str(number) for number in range(1, 8)}
-# Sections that a module may cite. A module that begins to cite the paper takes its place here.
+# The sections that each module may cite. Add modules that cite the paper here.
 TOPICS = {
     "prm": {"III-A", "III-G"},
     "rollout": {"III-A"},
@@ -78,13 +78,13 @@ def topic_of(file: Path) -> str:
 
 
 def citations(text: str, kind: str) -> Iterator[str]:
-    """The numbers that a text cites of a kind: "III-A", "I", "4"."""
+    """The cited numbers of one kind in a text, such as "III-A", "I", "4"."""
     for match in KINDS[kind][0].finditer(text):
         yield next(number for number in match.groups() if number)
 
 
 def wrong_citations(text: str) -> list[str]:
-    """Citations of what the paper does not have, and lists of sections that are not written in full."""
+    """Citations that do not exist in the paper, and lists of sections that are abbreviated."""
     missing = [
         f"{kind} {number}"
         for kind, (_, known) in KINDS.items()

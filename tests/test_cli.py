@@ -1,4 +1,4 @@
-"""The command line as other tools rely on it: what it takes, what it prints, and one line for bad input."""
+"""The command line: arguments, output, and errors of one line for bad input."""
 
 import errno
 import functools
@@ -28,14 +28,14 @@ ROW = (
 
 
 def shell(*arguments, **options):
-    """Run ``python ...`` as a person would, in a process of its own."""
+    """Run ``python ...`` in a separate process."""
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"} | options.pop("env", {})
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment, **options)
 
 
 def refused(capsys, *arguments):
-    """The one line with which a command is refused."""
+    """The error line of a command."""
     capsys.readouterr()
     assert main([str(each) for each in arguments]) == 2
     out, err = capsys.readouterr()
@@ -64,7 +64,7 @@ def test_table_shows_divergence_only_if_it_occurred(capsys, rates, shown):
 
 
 def test_json_is_only_output_on_stdout(tiny_run, islands):
-    """Through a real process, where libraries print what they like."""
+    """In a real process, where libraries may print."""
     done = shell(
         "-m", "ct_jax.cli", "evaluate", str(tiny_run.folder), "--maze", str(islands), "--episodes", "2", "--seed", "3",
         "--method", "planner", "--json", env={"XDG_CACHE_HOME": str(tiny_run.folder.parent / "cache")},
@@ -78,14 +78,14 @@ def test_json_is_only_output_on_stdout(tiny_run, islands):
 
 
 def test_imports_print_nothing():
-    """Not of the libraries that are looked for, either; nor does an experiment, before its help."""
+    """Missing optional libraries print nothing either. The first output of an experiment is its help."""
     assert shell("-c", "from ct_envs import MazeEnv").stdout == ""
     assert shell("experiments/point.py", "--help", cwd=ROOT).stdout.lstrip().startswith("usage:")
 
 
 @pytest.mark.parametrize("method", ["ct", "planner", "explorer"])
 def test_evaluate_reproduces_row_of_run(method, tiny, tiny_run, capsys):
-    """The same seed means the same pairs, in the run and afterwards."""
+    """The same seed gives the same pairs in the run and afterwards."""
     whole = [r for r in pipeline.results(tiny_run.folder) if (r["maze"], r["method"]) == ("antmaze-umaze", method)]
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4", "--method", method]
     assert main([*command, "--json"]) == 0
@@ -168,7 +168,7 @@ def test_help_contains_options_and_examples(command, words, capsys):
         main([*command, "--help"])
     out, err = capsys.readouterr()
     assert stop.value.code == 0 and err == ""
-    out = " ".join(out.split())  # as if there were no ends of lines
+    out = " ".join(out.split())  # ignore line breaks
     assert [word for word in words if word not in out] == []
 
 
@@ -285,7 +285,7 @@ def test_row_goes_to_stderr_if_stdout_fails(tiny, tiny_run, monkeypatch, capsys)
 
 
 def test_commands_leave_no_files_in_working_folder(tiny_run, tmp_path):
-    """Not of MuJoCo either, which has a log for its warnings."""
+    """MuJoCo writes no log file either."""
     nowhere = tmp_path / "here"
     nowhere.mkdir()
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}

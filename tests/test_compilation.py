@@ -1,4 +1,4 @@
-"""Everything compiles once: once in a process, and once for all the processes of a user."""
+"""Each program is compiled once per process, and once for all processes of a user."""
 
 import json
 import os
@@ -25,7 +25,7 @@ FOLDER = "jax_compilation_cache_dir"
 
 
 def count(arguments, settings, home, file):
-    """A command in a process of its own; writes down how many programs it asked for, and how many were there."""
+    """Run a command in a separate process, which records the number of programs and of cache hits."""
     from ct_envs import robots
     from ct_jax import cli, presets
 
@@ -48,7 +48,7 @@ def counts(fork, arguments, settings, tmp_path):
 
 
 def test_second_evaluation_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
-    """Programs that step MuJoCo, too; and nobody else can get at them."""
+    """This includes programs that step MuJoCo. Other users cannot access the cache."""
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2"]
     asked, there = counts(fork, command, tiny_settings, tmp_path)
     assert there < asked
@@ -84,7 +84,7 @@ def test_acting_compiles_once_for_mazes_of_same_size(tiny_run, islands):
 
 @pytest.fixture
 def kept(monkeypatch, tmp_path):
-    """Calls ``keep_programs`` with nothing configured; the folder that it chooses, and the home it should be in."""
+    """Call ``keep_programs`` without configuration; returns the chosen folder and the expected home folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
 
     def keep():

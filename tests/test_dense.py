@@ -1,4 +1,4 @@
-"""Dense layers and dropout: those of flax, in another order."""
+"""Dense layers and dropout: equal to those of flax, with another order of operations."""
 
 import flax.linen as nn
 import jax

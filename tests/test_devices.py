@@ -1,4 +1,4 @@
-"""Several devices and several processes, for real: the same losses, checkpoints and episodes as on one device."""
+"""Several real devices and processes: the same losses, checkpoints and episodes as on one device."""
 
 import fcntl
 import os
@@ -29,7 +29,7 @@ def begin(*arguments: str, host_devices: int = 1) -> subprocess.Popen:
 
 
 def finish(*processes: subprocess.Popen, timeout_s: float = 300.0) -> None:
-    """Wait for all of them; none is left behind, whatever happens."""
+    """Wait for all processes, and end those that remain."""
     try:
         said = [process.communicate(timeout=timeout_s)[0] for process in processes]
     finally:
@@ -47,7 +47,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory, toy_data):
-    """What came of one device, of four in one process, and of two processes, by name; once for all test workers."""
+    """Results by name: one device, four devices in one process, and two processes. All test workers share them."""
     ours = tmp_path_factory.getbasetemp()
     folder = (ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours) / "devices"
     folder.mkdir(exist_ok=True)
@@ -87,13 +87,13 @@ def test_training_resumes_on_any_number_of_devices(runs, name, saved):
 
 @pytest.mark.parametrize("name", ["four", "two"])
 def test_device_receives_only_sampled_steps(runs, name):
-    """Of all that a device holds a share of, it is sent only the steps that were drawn."""
+    """A device receives only the sampled steps, not the trajectories."""
     sent, rows, table = (int(runs[name][what]) for what in ("sent", "rows", "table"))
     assert 0 < sent <= rows < table
 
 
 def by_goal(run) -> tuple[np.ndarray, ...]:
-    """Collected trajectories, in an order that does not depend on which process collected them."""
+    """Collected trajectories, sorted so that the order does not depend on the processes."""
     order = np.lexsort(run["goal"].T)
     return tuple(run[name][order] for name in ("goal", "length", "collected"))
 

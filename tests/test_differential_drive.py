@@ -1,4 +1,4 @@
-"""The Turtlebot3's controller: it arrives from any pose, saturates, and is proportional below that."""
+"""The controller of the Turtlebot3: it reaches goals from any pose, saturates, and is proportional below saturation."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SEEDS = st.integers(0, 2**31 - 1)
 
 
 def move(position: np.ndarray, yaw: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where robots are that keep v and omega for a control step: on an arc."""
+    """The poses after a control step with constant v and omega, on an arc."""
     v, omega = speeds(action).T
     half = omega * DT_S / 2
     chord = v * DT_S * np.sinc(half / np.pi)
@@ -27,7 +27,7 @@ def move(position: np.ndarray, yaw: np.ndarray, action: np.ndarray) -> tuple[np.
 def test_controller_reaches_goal_from_any_pose(controller, seed):
     rng = np.random.default_rng(seed)
     position, yaw = rng.uniform(-3, 3, (64, 2)), rng.uniform(-np.pi, np.pi, 64)
-    yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal right behind
+    yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal is behind the robot
     for _ in range(400):
         position, yaw = move(position, yaw, controller(to_heading(-position, yaw)))
     assert np.linalg.norm(position, axis=-1).max() < 0.05
@@ -70,7 +70,7 @@ def test_controller_turns_before_driving():
 @given(SEEDS)
 @settings(max_examples=20)
 def test_wheel_speeds_match_motion_of_robot(seed):
-    """The mean of the wheels' ways is the robot's, their difference its turn times the separation."""
+    """The mean distance of the wheels is that of the robot; their difference is the turn times the wheel separation."""
     rng = np.random.default_rng(seed)
     v, omega = rng.uniform(-1, 1, (2, 30)) * [[TOP_SPEED_MPS], [TOP_TURN_RADPS]]
     left, right = 0.033 * wheel_speeds(v, omega).T

@@ -1,4 +1,4 @@
-"""What people read: links, anchors, pictures, commands, files and settings named in README.md and docs/ exist."""
+"""Documentation: links, anchors, pictures, commands, files and settings in README.md and docs/ exist."""
 
 import contextlib
 import dataclasses
@@ -53,7 +53,7 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_links(file: Path, text: str) -> list[str]:
-    """Relative links and pictures of a page that lead nowhere; and pictures on other hosts."""
+    """The broken relative links and pictures of a page, and pictures on other hosts."""
     broken = []
     for picture, target in LINK.findall(prose(text)):
         if re.match(r"[a-z]+:", target):
@@ -118,14 +118,14 @@ def lines_of_code(text: str) -> list[str]:
 
 
 def commands(start: str) -> list[str]:
-    """All commands in the pages that start so, but for those with a placeholder."""
+    """All commands in the pages with this start, without those that have a placeholder."""
     found = [line for file in PAGES for line in lines_of_code(file.read_text("utf-8"))]
     found = [line[line.index(start) :] for line in found if re.search(rf"(^|[ /]){re.escape(start)}", line)]
     return [each for each in dict.fromkeys(found) if not re.search(r"\.\.\.|COMMAND|ROBOT|FILE| \| ", each)]
 
 
 def parse(options: type, arguments: list[str]) -> object:
-    """What tyro makes of arguments; fails the test with tyro's words."""
+    """Parse arguments with tyro. An error of tyro fails the test."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -141,7 +141,7 @@ def test_ct_jax_commands_parse(command):
 
 
 def test_experiment_commands_parse():
-    """Those that made the results included: they must work for who wants to make them again."""
+    """This includes the commands that made the results, because users may want to repeat them."""
     found = commands("python experiments/")
     assert len(found) > 100
     classes = {"point": study.MazeOptions, "ant": study.MazeOptions, "humanoid": study.MazeOptions}
@@ -152,7 +152,7 @@ def test_experiment_commands_parse():
         options = (
             classes.get(module.__name__) or getattr(module, "RoomOptions", None) or getattr(module, "Options", None)
         )
-        if options is None:  # it has none
+        if options is None:
             assert not arguments
             continue
         chosen = parse(options, arguments)

@@ -1,4 +1,4 @@
-"""The experiments: what their variants are, that all rows are made once and kept, and that the pages show them."""
+"""The experiments: their variants, rows that are measured once and kept, and pages that show them."""
 
 import importlib
 import re
@@ -52,7 +52,7 @@ pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 
 def a_row(variant="cpu", seed=0, method="ct", success="01", **more) -> Row:
-    """A row of a model with these successes."""
+    """A row of a model with these outcomes."""
     head = {"variant": variant, "model_seed": seed, "method": method, "robot": "point", "maze": "m", "seen": True}
     head |= {"episodes": len(success), "seed": 0, "outcomes": {"success": success}}
     return Row.read(MADE | head | {"success_rate": success.count("1") / len(success)} | more)
@@ -68,7 +68,7 @@ def fits_of(settings):
 
 @pytest.mark.parametrize("robot", study.ROBOTS)
 def test_variants_override_existing_settings(robot):
-    """And each fine-tuned one names the variant that it was before: the same data, without rounds."""
+    """Each fine-tuned variant names its variant before fine-tuning, which has the same data and no rounds."""
     variants = load_variants(robot)
     assert variants[sys.modules[robot].SHIPPED].preset == "cpu"
     for name, variant in variants.items():
@@ -78,7 +78,7 @@ def test_variants_override_existing_settings(robot):
             before = variants[variant.tuned_from].settings(robot)
             assert settings.rounds > 0 == before.rounds, name
             assert variant.preset == variants[variant.tuned_from].preset, name
-            if settings.rooms == before.rooms:  # "dense" has other rooms
+            if settings.rooms == before.rooms:  # the rooms of "dense" differ
                 assert settings.collect == before.collect, name
 
 
@@ -94,7 +94,7 @@ def test_variants_match_methods_of_table(robot):
     assert list(known)[:7] == ["published", "bc", "f-ct", "pt-cql", "sac", "cpu-ct", "cpu"]
     assert [name for name, variant in known.items() if variant.baseline] == ["pt-cql", "sac"]
     variants = {name: variant.settings(robot) for name, variant in known.items()}
-    for name in ("roam", "modes+roam", "modes+memory+roam"):  # CT of the one maze, failures of many
+    for name in ("roam", "modes+roam", "modes+memory+roam"):  # trajectories from one maze, recoveries from many
         tuned, ct = variants[name], variants[known[name].tuned_from or ""]
         assert tuned.recover.random_mazes > 0 == tuned.random_mazes == ct.random_mazes and tuned.collect == ct.collect
     assert all(variants[name] == variants["published"] for name in ("pt-cql", "sac"))  # the same data
@@ -110,7 +110,7 @@ def test_variants_match_methods_of_table(robot):
     assert lifted.last_fit is not None and lifted_ct.fit == replace(lifted.last_fit, shift_timestep=300)
     of_many_ct, of_many = (variants[name] for name in ("mazes-ct", "mazes"))
     assert of_many_ct.random_mazes == of_many.random_mazes > 0
-    assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
+    assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # the same number of updates
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(variants[name], model=one.model) == one and variants[name].model.modes > 1
     for name, one in (("skill-ct", lifted_ct), ("skill", lifted)):
@@ -126,7 +126,7 @@ def test_variants_match_methods_of_table(robot):
     assert variants["modes"].model.commitment > variants["modes-ct"].model.commitment == 0.0
     sac = known["sac"].baseline
     assert isinstance(sac, SacConfig) and sac.iterations >= 4 * get_robot(robot).horizon
-    SacAlone(MazeEnv(robot, engine="mujoco"), replace(sac, replay=2000))  # its settings are for it
+    SacAlone(MazeEnv(robot, engine="mujoco"), replace(sac, replay=2000))  # the settings are valid for it
 
 
 def test_unknown_variant_is_error():
@@ -174,17 +174,17 @@ def test_turtlebot3_variants_share_stages():
 
 @pytest.fixture
 def tiny_study(tiny_settings, tmp_path, monkeypatch):
-    """A study whose presets are all the tiny one."""
+    """A study in which all presets are the tiny one."""
     monkeypatch.setattr(study, "get_preset", lambda name, robot: tiny_settings)
     return Study(robot="point", preset="tiny", out=tmp_path)
 
 
 def ignore(found: Results) -> None:
-    """Keeps nothing."""
+    """Ignore the results."""
 
 
 def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_study, monkeypatch):
-    """A finished run is taken as it is, the baselines are learned from its data, and nothing is done twice."""
+    """A finished run is not repeated, and the baselines are trained on its data."""
     shutil.copytree(tiny_run.folder, tiny_study.out / "one-0")
     mazes = ((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],), ("antmaze-umaze",))
     monkeypatch.setattr(study, "default_mazes", lambda robot: mazes)
@@ -198,7 +198,7 @@ def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
     assert [row.variant for row in rows] == [*["one"] * 6, *["pt-cql"] * 2, *["sac"] * 2]
     assert all(row.episodes == 4 and row.seed == 0 for row in rows)
     assert all(0 < (row.learn_wall_s or 0) <= row.run_wall_s for row in rows if row.method in ("pt-cql", "sac"))
-    assert all(set(row.more) >= {"success_ci95", "return_mean"} for row in rows)  # and all else that was measured
+    assert all(set(row.more) >= {"success_ci95", "return_mean"} for row in rows)  # and all other measurements
     monkeypatch.setattr(study, "train_cql", None)
     assert tiny_study.run(variants, (0,), ignore).rows == rows
     variants["pt-cql"] = Variant("tiny", baseline=replace(cql, updates=3))
@@ -207,7 +207,7 @@ def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
 
 
 def test_sac_alone_needs_no_controller_and_no_data(tiny_settings, tiny_study, monkeypatch):
-    """No controller, no trajectories: its run holds a policy and its rows."""
+    """Its run contains only a policy and rows: no controller and no trajectories."""
     monkeypatch.setattr(study, "default_mazes", lambda robot: (("antmaze-umaze",), ()))
     sac = replace(tiny_settings.sac, iterations=4, warmup=1)
     (row,) = tiny_study.run({"sac": Variant("tiny", baseline=sac)}, (0,), ignore).rows
@@ -216,7 +216,7 @@ def test_sac_alone_needs_no_controller_and_no_data(tiny_settings, tiny_study, mo
 
 
 def test_references_have_one_row_per_margin(tiny_settings, tiny_study, monkeypatch):
-    """A planner that keeps away from walls is another one: it stands beside what it taught."""
+    """A planner with another margin is another reference, and has its own row."""
     margin = tiny_settings.prm.margin_m
     variants = {
         "one": Variant("tiny"), "two": Variant("tiny", {"rounds": 2}), "wary": Variant("tiny", {"prm.margin_m": 0.3}),
@@ -252,7 +252,7 @@ def test_failed_run_does_not_stop_others(tiny_study, monkeypatch):
 
 
 def test_missing_recoveries_are_recorded_as_result(tiny_study, tmp_path, monkeypatch):
-    """The others go on; the reason stands in the results until there is a row, and on the page."""
+    """The other runs continue. The reason is in the results and on the page until the row exists."""
 
     def measure(run, name, variant):
         if name == "f-ct":
@@ -299,7 +299,7 @@ def test_stages_with_same_inputs_are_shared(tiny_run, tiny_settings, tmp_path):
         assert stages == list(study.STAGES)[: taken[name]], name
         rows = {file.stem.rpartition("-")[2] for file in (other.folder / "evaluate").glob("*.json")}
         assert rows == ({"planner", "explorer"} if taken[name] else set()), name
-        assert share([source], other) is None  # and again changes nothing
+        assert share([source], other) is None  # a second call changes nothing
     ours = stage_digests(source)
     assert len({*ours.values()}) == len(ours) and stage_digests(source) == ours
 
@@ -338,14 +338,14 @@ def test_rows_of_other_commands_are_kept(tmp_path):
         ("ct", 1, "ct", 0.5), ("bc", 0, "ct", 0.5), ("bc", 0, "planner", 0.5), ("ct", 0, "ct", 1.0),
     ]  # fmt: skip
     assert found.noise == [a_row("ct", 0)]
-    again = a_row("bc", 0, "planner", "01", margin_m=0.0)  # early rows do not name the margin that they had not
+    again = a_row("bc", 0, "planner", "01", margin_m=0.0)  # early rows have no margin
     wary = a_row("cpu", 0, "planner", "11", margin_m=0.3)
     add_results(file, Results(rows=[again, wary]))
     assert [row for row in Results.read(file).rows if row.method == "planner"] == [again, wary]
 
 
 def test_rows_with_old_settings_are_dropped(tmp_path, capsys):
-    """A variant that was changed is measured again, all of it: no table joins what was trained in two ways."""
+    """All rows of a changed variant are dropped, so that no table mixes old and new settings."""
     file = tmp_path / "results.json"
     old = [a_row("cpu", seed, settings="old") for seed in (0, 1)]
     stays = [a_row("cpu", 0, "planner", settings="old"), a_row("ct", 0, settings="ct's")]
@@ -376,11 +376,11 @@ def test_gain_of_fine_tuning_is_computed_per_pair():
     assert differences(Results(rows=before + other), known) == []
     assert interval_of_mean(np.zeros((3, 100))) == (0.0, 0.0)
     low, high = interval_of_mean(np.tile([0.0, 1.0], (3, 50)))
-    assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # as a binomial's, were models alike
+    assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # a binomial interval if the models were equal
 
 
 def test_interval_is_wider_if_models_differ():
-    """Rates of 88, 84 and 78 of 100 are not known to two of 100; three that agree are, and one is as Wilson says."""
+    """The interval is wide for rates of 88, 84 and 78 %, and a Wilson interval for equal models or one model."""
 
     def width(*rates):
         rows = [a_row(success="1" * round(500 * rate) + "0" * round(500 * (1 - rate))) for rate in rates]
@@ -388,7 +388,7 @@ def test_interval_is_wider_if_models_differ():
         return int(high) - int(low)
 
     assert width(0.884, 0.836, 0.78) >= 8
-    assert width(0.836) in (6, 7) and width(0.836, 0.836, 0.836) in (6, 7)  # the same pairs three times
+    assert width(0.836) in (6, 7) and width(0.836, 0.836, 0.836) in (6, 7)  # three models with the same outcomes
 
 
 def test_maze_table_has_variants_in_order_and_references_last():
@@ -443,7 +443,7 @@ def test_gain_table_has_one_line_per_f_ct_and_ct():
     ]
     assert [line[-1].split()[0] for line in lines] == ["+12.5", "+100.0"]
     assert table(*one, *many)[1] == lines[0]  # in any order
-    roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # of whose CT, cpu-ct, there is no seed 1
+    roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # its CT, cpu-ct, has no seed 1
     (line,) = (line for line in table(*one, *roaming) if line[1] == "`roam`")
     assert line[4] == "1" and line[-1].startswith("+75.0")
     (line,) = (line for line in table(*one, *roaming, row("long-ct", 1, "0111")) if line[2] == "`long-ct`")
@@ -469,7 +469,7 @@ def test_transfer_table_interpolates_updates():
         for mark, rate in zip((25, 50, 100), curve, strict=True)
     ]  # fmt: skip
     lines = transfer_table(rows)
-    # 51 of 60 points of the way from 50 to 100
+    # 51 of 60 percentage points between 50 and 100 updates
     assert lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
     assert lines[3] == "| point | `cpu-0` | from the trunk of the ant's cpu-0 | 1 | 50 | 85 | 90 | 46 |"
 
@@ -514,7 +514,7 @@ def written():
 
 
 def test_pages_match_results_files(written):
-    """README's summary, docs/results, docs/speed.md and the model cards are what the result files give."""
+    """README's summary, docs/results, docs/speed.md and the model cards are up to date."""
     stale = [str(file.relative_to(pages.ROOT)) for file, text in written.items() if file.read_text("utf-8") != text]
     assert not stale, "run: python experiments/pages.py"
     assert {file.name for file in pages.PAGES.glob("*.md")} == {f.name for f in written if f.parent == pages.PAGES}
@@ -525,7 +525,7 @@ def test_all_plots_exist():
 
 
 def test_all_rows_are_on_pages_with_origin(written):
-    """No result is left out, and none is without its command and commit."""
+    """No result is left out, and all have their command and commit."""
     for name, found in pages.load_results().items():
         text = written[pages.PAGES / f"{name.partition('-')[0]}.md"]
         for row in [row for kind in LISTS for row in getattr(found, kind)] + found.unmade:

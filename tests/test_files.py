@@ -1,4 +1,4 @@
-"""What is written: whole or not at all, where it was asked for, for everyone whom the umask lets read it."""
+"""Writing files: complete or not at all, not through links, and with the permissions of the umask."""
 
 import functools
 import os
@@ -19,13 +19,12 @@ from ct_jax.cli import main
 from ct_jax.files import append_to, check_writable, drop_parts, make_folder, save_arrays, whole, write_text
 from ct_jax.progress import Metrics
 
-CONTENT = np.random.default_rng(0).random(20_000)  # that no compression makes small
+CONTENT = np.random.default_rng(0).random(20_000)  # it cannot be compressed
 
 
 @contextmanager
 def no_room(most: int = 1000):
-    """No file may become larger than this: what the system then says is what it says of a full disk, but for the
-    number."""
+    """A limit of the file size, which stands for a full disk. The system's error differs only in its number."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
     try:
@@ -63,7 +62,7 @@ WRITERS = {
 
 @pytest.fixture(params=WRITERS)
 def writer(request, tmp_path):
-    """A file in a folder of its own, and what writes it."""
+    """A file in its own folder, and a function that writes it."""
     (tmp_path / "inside").mkdir()
     return tmp_path / "inside" / request.param, functools.partial(WRITERS[request.param])
 
@@ -191,7 +190,7 @@ def test_files_of_run_have_same_permissions(tiny_run):
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.slow
 def test_links_in_run_folder_are_not_followed(tiny, tiny_run, tmp_path):
-    """Links lie where the run is about to write each of its files."""
+    """There is a link in the place of each file that the run will write."""
     folder, outside = tmp_path / "run", tmp_path / "outside"
     outside.mkdir()
     appended = {"config.json", "metrics.jsonl", "run.lock"}

@@ -1,4 +1,4 @@
-"""Python that compiled programs call by name: it gets XLA's own buffers, and what it raises is told."""
+"""Python functions that compiled programs call by name: they get XLA's buffers, and their exceptions are raised."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The humanoid: its body, its falls, its limbs at walls, and both engines moving it alike."""
+"""The humanoid: its body, falls, contacts of its limbs with walls, and the agreement of both engines."""
 
 import functools
 
@@ -48,7 +48,7 @@ def test_body_equals_gymnasium_humanoid():
     leg, right_arm, left_arm = [[-25, 5], [-60, 35], [-110, 20], [-160, -2]], [[-85, 60]] * 2, [[-60, 85]] * 2
     ranges = [[-45, 45], [-75, 30], [-35, 35], *leg, *leg, *right_arm, [-90, 50], *left_arm, [-90, 50]]
     np.testing.assert_allclose(np.rad2deg(model.jnt_range[1:]), ranges)
-    right_knee, right_hip_y = 1, 0.01  # of gymnasium's: 0 and 0.008
+    right_knee, right_hip_y = 1, 0.01  # gymnasium has 0 and 0.008
     stiffness = [20, 10, 10, 10, 10, 20, right_knee, 10, 10, 20, 1, 1, 1, 0, 1, 1, 0]
     np.testing.assert_array_equal(model.jnt_stiffness[1:], stiffness)
     np.testing.assert_array_equal(model.dof_damping[6:], [*[5] * 6, 1, *[5] * 3, 1, *[1] * 6])
@@ -114,7 +114,7 @@ def test_humanoid_falls_without_actions():
     state = state.replace(pipeline_state=state.pipeline_state.replace(qpos=lying))
     state = step(state, jnp.zeros((N, 17)))
     np.testing.assert_array_equal(state.info["fall"], [0, 1, 0, 0])
-    np.testing.assert_array_equal(state.info["success"], [1, 0, 1, 1])  # a fall at the goal is none
+    np.testing.assert_array_equal(state.info["success"], [1, 0, 1, 1])  # a fall at the goal is not a success
     state = reset(keys(0), UMAZE, STANDING)
     for _ in range(100):
         state = step(state, jnp.zeros((N, 17)))
@@ -137,7 +137,7 @@ def test_all_limbs_collide_with_walls_and_floor():
 
 
 def test_limbs_stay_within_touch_distance():
-    """In any pose of its joints, leaning as far as a robot does that has not fallen."""
+    """In any pose of its joints, and at the largest tilt without a fall."""
     model = mujoco.MjModel.from_xml_string(model_xml(HUMANOID))
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(2000):

@@ -1,4 +1,4 @@
-"""MazeEnv: pure, one program for every maze, and honest at the end of an episode."""
+"""MazeEnv: pure functions, one program for all mazes, and correct outcomes at the end of an episode."""
 
 import functools
 from collections import Counter
@@ -18,7 +18,7 @@ from ct_envs.occupancy import local_map
 N = 8
 UMAZE = load_maze("antmaze-umaze")
 LARGE = load_maze("antmaze-large")
-NEAR = Tasks(  # reached by standing still, by going right for a step or two, and not within the horizon
+NEAR = Tasks(  # the goal is reached without motion; after a step or two to the right; not within the horizon
     start=jnp.array([[6.0, 6.0], [6.0, 6.0], [6.0, 6.0]]),
     goal=jnp.array([[6.0, 6.2], [6.9, 6.0], [13.0, 14.0]]),
     n=jnp.array(3),
@@ -27,22 +27,22 @@ NEAR = Tasks(  # reached by standing still, by going right for a step or two, an
 
 @functools.cache
 def compiled(engine: str = "mujoco", **options):
-    """The step of N environments at once. Tests of the same options share the program."""
+    """The compiled step of N environments. Tests with the same options share the program."""
     return jax.jit(jax.vmap(MazeEnv(POINT, engine=engine, **options).step))
 
 
-# Beginnings are the same whatever the options; one maze and one set of tasks serve all N.
+# Resets do not depend on the options. All N environments have the same maze and tasks.
 reset = jax.jit(jax.vmap(MazeEnv(POINT, engine="mujoco").reset, (0, None, None)))
 HORIZON = 4
 
 
 def far(tasks: Tasks) -> Tasks:
-    """Only the last of three tasks."""
+    """Tasks with only the last of three tasks."""
     return tasks.replace(start=jnp.tile(tasks.start[2:], (3, 1)), goal=jnp.tile(tasks.goal[2:], (3, 1)))
 
 
 def at_step(state, number: int):
-    """The state with its clocks set to that number of steps."""
+    """The state with its step counters set to this number."""
     steps = jnp.full_like(state.pipeline_state.episode_steps, number)
     return state.replace(pipeline_state=state.pipeline_state.replace(episode_steps=steps))
 
@@ -56,7 +56,7 @@ def actions(seed: int, length: int, n: int = N) -> jax.Array:
 
 
 def assert_same(a, b, **tolerance) -> None:
-    """Two states hold the same numbers; keys are compared as they are."""
+    """Compare two states; random keys must be identical."""
 
     def plain(leaf):
         return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
@@ -78,7 +78,7 @@ def test_maze_env_is_brax_environment():
     assert after.reward.shape == after.done.shape == (2,)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), after
-    )  # so it can be scanned
+    )  # so it can be used in a scan
 
 
 def test_observations_without_maps_have_other_entries():
@@ -148,7 +148,7 @@ def test_each_environment_has_its_own_maze():
     assert_same(state.info["maze"], stack_mazes(singles))
     together = [state := step(state, action) for action in actions(4, 4)]
     for i in range(4):
-        alone = alike[i]  # the others run in this maze too, and are not looked at
+        alone = alike[i]  # the other environments are in this maze, too; only the i-th is compared
         for action, other in zip(actions(4, 4), together, strict=True):
             alone = step(alone, action)
             assert_same(*(jax.tree.map(lambda leaf: leaf[i], s.obs) for s in (alone, other)), atol=1e-5)  # noqa: B023
@@ -200,7 +200,7 @@ def test_actions_beyond_one_are_clipped():
 
 
 def test_collision_is_reported_during_contact(wall_distance):
-    """The engines tell it of the last substep's beginning, so a first or last touch may go unseen."""
+    """The engines report contacts at the start of the last substep, so the first or last contact may be missed."""
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(7), LARGE, None)
     distances, told = [], []
@@ -211,7 +211,7 @@ def test_collision_is_reported_during_contact(wall_distance):
     distance, told = np.stack(distances), np.stack(told) > 0
     touching = distance < POINT.radius_m
     steady = (np.abs(distance - POINT.radius_m) > 1e-3)[1:] & (touching[1:] == touching[:-1])
-    assert (told == touching)[1:][steady].mean() > 0.98  # but for a touch between two steps
+    assert (told == touching)[1:][steady].mean() > 0.98  # except contacts between two steps
     assert 0.1 < told[1:][steady].mean() < 0.9 and steady.mean() > 0.8
 
 
@@ -256,7 +256,7 @@ def test_reset_velocity_has_given_deviation():
 
 
 def test_auto_reset_returns_outcome_and_new_episode(wall_distance):
-    """Beside an environment without it: outcomes are the same at every step, and what follows unless done."""
+    """Compared with an environment without auto-reset: the outcomes are equal, and so are unfinished states."""
     step, plain_step = compiled(horizon=HORIZON), compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(11), UMAZE, NEAR)
     outcomes = Counter()
@@ -264,7 +264,7 @@ def test_auto_reset_returns_outcome_and_new_episode(wall_distance):
         after, plain = step(state, action), plain_step(state.replace(done=jnp.zeros(N)), action)
         for name in ("success", "truncation", "collision"):
             np.testing.assert_array_equal(after.info[name], plain.info[name])
-        np.testing.assert_array_equal(after.done, plain.executed)
+        np.testing.assert_array_equal(after.done, plain.done)
         np.testing.assert_allclose(after.reward, plain.reward, rtol=1e-5)
         done = np.asarray(after.done) > 0
         pick = lambda state: (state.pipeline_state, state.obs, state.info["goal"], state.info["episode_steps"])  # noqa: E731
@@ -301,7 +301,7 @@ def test_horizon_truncates():
 
 
 def test_success_at_horizon_is_not_truncation():
-    """The goal is where the robot comes just when time is up."""
+    """The robot reaches the goal in the last step of the horizon."""
     step, right = compiled(horizon=HORIZON, auto_reset=False), jnp.broadcast_to(jnp.array([1.0, 0.0]), (N, 2))
     states = [reset(keys(14), UMAZE, far(NEAR))]
     for _ in range(HORIZON):
@@ -341,7 +341,7 @@ def test_finished_environment_does_not_change_without_auto_reset():
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("what", ["action", "state"])
 def test_non_finite_values_end_their_own_episode_only(monkeypatch, tmp_path, engine, bad, what):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning of a state there
+    monkeypatch.chdir(tmp_path)  # MuJoCo would write its log file there
     step, state, action = compiled(engine, horizon=HORIZON), reset(keys(17), LARGE, None), actions(17, 1)[0]
     clean = step(state, action)
     sick = np.arange(N) == 3
@@ -417,7 +417,7 @@ def test_invalid_tasks_are_error(change, match):
     assert_one_line(lambda: check_tasks(tasks, UMAZE), match)
     for shared in (jax.vmap(ENV.reset, (0, None, None)), lambda *a: jax.jit(lambda k: ENV.reset(k, *a[1:]))(a[0][0])):
         assert_one_line(lambda: shared(keys(0, 2), UMAZE, tasks), match)  # noqa: B023
-    jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE, tasks)  # without values, nobody can tell
+    jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE, tasks)  # without values, no error
 
 
 def test_padding_of_tasks_is_not_checked():

@@ -1,4 +1,4 @@
-"""The local occupancy map, against a plain loop over its cells and under the symmetries of the square."""
+"""The local occupancy map, compared with a plain loop over its cells, and under the symmetries of the square."""
 
 import functools
 
@@ -12,7 +12,7 @@ from ct_envs import UserError, load_maze, make_maze, random_walls
 from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, MAP_CELLS, lidar_map, local_map
 
 SEEDS = st.integers(0, 2**31 - 1)
-CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the second is our setting, the first the Turtlebot3's
+CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the first is that of the Turtlebot3, the second that of the mazes
 WORLDS = st.builds(lambda seed: random_walls(seed, height=9, width=12, density=0.7), SEEDS)
 
 
@@ -22,7 +22,7 @@ def draw(walls_maze, position, goal, cell_m, cells=MAP_CELLS):
 
 
 def naive(walls: np.ndarray, position, goal, cell_m: float, cells: int = MAP_CELLS) -> np.ndarray:
-    """The same map, cell after cell, from the words of the docstring."""
+    """The same map, computed cell by cell from the definition in the docstring."""
     picture = np.zeros((2, cells, cells))
     for i in range(cells):
         for j in range(cells):
@@ -36,7 +36,7 @@ def naive(walls: np.ndarray, position, goal, cell_m: float, cells: int = MAP_CEL
 
 
 def draw_pose(seed: int, walls: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """A position anywhere and a goal near its window, such that no point of the map is on a cell's border."""
+    """A random position, and a goal near its window. No point of the map is on the border of a cell."""
     rng = np.random.default_rng(seed)
     position = rng.random(2) * np.array(walls.shape[::-1]) * 4.0
     goal = position + rng.uniform(-0.7, 0.7, 2) * MAP_CELLS * cell_m
@@ -74,7 +74,7 @@ def test_goal_is_one_cell_if_inside_window(walls, seed, cell_m):
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=10)
 def test_map_is_equivariant(flip_x, flip_y, transpose, walls, seed, cell_m):
-    """The 8 symmetries of the square: the map of the image is the image of the map."""
+    """For the 8 symmetries of the square: the map of the transformed world is the transformed map."""
 
     def image(grid: np.ndarray) -> np.ndarray:
         grid = grid[..., :: -1 if flip_y else 1, :: -1 if flip_x else 1]
@@ -103,7 +103,7 @@ def test_number_of_cells_crops_window(walls, seed):
 @given(SEEDS)
 @settings(max_examples=10)
 def test_cell_size_scales_window(seed):
-    """A world twice as large through cells twice as large looks the same."""
+    """A world twice as large, with cells twice as large, gives the same map."""
     walls = random_walls(seed)
     position, goal = draw_pose(seed, walls, 0.8)
     one = draw(make_maze(walls, cell_m=4.0), position, goal, np.float32(0.8))
@@ -123,7 +123,7 @@ def test_maps_are_uint8_zeros_and_ones():
 
 
 def draw_ranges(seed: int) -> np.ndarray:
-    """Ranges of which half are within the metre, none of them ending near a cell's border."""
+    """Random ranges; half of them are below 1 m. No beam ends near the border of a cell."""
     ranges = np.random.default_rng(seed).uniform(0.1, 1.9, LIDAR_BEAMS)
     angle = np.radians(np.arange(LIDAR_BEAMS))
     ticks = ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1) / LIDAR_CELL_M + 0.5
@@ -148,7 +148,7 @@ def test_lidar_marks_exactly_the_end_cells_of_beams(seed):
 @given(SEEDS, st.integers(0, 3))
 @settings(max_examples=20)
 def test_lidar_map_is_equivariant_to_rotation(seed, quarters):
-    """Beams a quarter turn on, or a robot that has turned by one: the map is turned by one."""
+    """A rotation of the beams or of the robot by a quarter turn rotates the map by a quarter turn."""
     ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
     here = lidar_map(ranges, goal)
     a = quarters * np.pi / 2
@@ -184,7 +184,7 @@ def test_both_maps_have_same_goal_cell(seed):
     goal = np.random.default_rng(seed).uniform(-1.2, 1.2, 2)
     halves = goal / LIDAR_CELL_M + 0.5
     assume(np.abs(halves - np.round(halves)).min() > 1e-3)
-    far = np.float32([50.0, 50.0])  # of an empty room
+    far = np.float32([50.0, 50.0])  # in an empty room
     maze = make_maze(random_walls(0, height=30, width=30, density=0.0))
     drawn = draw(maze, far, far + np.float32(goal), np.float32(LIDAR_CELL_M))
     np.testing.assert_array_equal(lidar_map(np.full(LIDAR_BEAMS, 3.5), goal), drawn)

@@ -1,4 +1,4 @@
-"""The pipeline: a run's folder, and that whatever stops it, the next one goes on as if nothing had."""
+"""The pipeline: the folder of a run, and resuming after any interruption."""
 
 import contextlib
 import dataclasses
@@ -108,7 +108,7 @@ def test_model_round_trip_is_identity(tiny_run, tiny_settings):
 def test_random_mazes_are_in_data_but_not_in_evaluation(tiny_settings, tmp_path):
     collecting = dataclasses.replace(tiny_settings.collect, trajectories=6, reset_interval=2)
     settings = dataclasses.replace(tiny_settings, controller="zoo", random_mazes=3, collect=collecting, rounds=0)
-    run = make_run(tmp_path / "run", settings)  # a trained controller arrives in every maze
+    run = make_run(tmp_path / "run", settings)  # a trained controller succeeds in every maze
     pipeline.train(run)
     data = storage.load(run.folder / "collect" / "trajectories.npz")
     assert set(data.maze.tolist()) > {0} and data.maze.max() <= 3
@@ -149,7 +149,7 @@ def test_skill_head_equals_controller_after_all_rounds(tiny_settings, tmp_path):
 
 
 def test_run_keeps_copy_of_given_controller(tiny_run, tiny_settings, tmp_path):
-    """Whatever comes to lie where it came from."""
+    """Later changes at the source do not affect the run."""
     source = tmp_path / "source"
     shutil.copytree(tiny_run.folder / "controller", source / "controller")
     settings = dataclasses.replace(tiny_settings, controller=str(source), controller_action_scale=0.5)
@@ -165,7 +165,7 @@ def test_run_keeps_copy_of_given_controller(tiny_run, tiny_settings, tmp_path):
 
 
 def test_random_mazes_are_fixed():
-    """A run's config names their number only."""
+    """The config of a run contains only their number."""
     few, many = random_mazes(2), random_mazes(4)
     assert all((a.walls == b.walls).all() for a, b in zip(few, many, strict=False))
     text = "".join(maze_text(maze) for maze in many)
@@ -188,7 +188,7 @@ def test_finished_run_is_not_repeated(tiny, tiny_run, tmp_path, monkeypatch):
 
 
 def interrupt_in(monkeypatch, name, number):
-    """Sends a signal when the bar of that name moves for the first time."""
+    """Send a signal at the first update of the bar with this name."""
     update = Bar.update
 
     def moved(bar, done, note=""):
@@ -201,8 +201,8 @@ def interrupt_in(monkeypatch, name, number):
 
 
 def test_interrupted_run_equals_uninterrupted_run(tiny, tiny_run, tmp_path, monkeypatch, capsys):
-    """Stopped in the middle of every stage, by Ctrl-C and by SIGTERM: each time the rest is kept, and at the end
-    weights and results are those of the run that nothing stopped, to the last bit."""
+    """It is interrupted in all stages, by Ctrl-C and by SIGTERM. Finished work is kept, and the final weights and
+    results equal those of an uninterrupted run bit for bit."""
     folder = tmp_path / "stopped"
     command = [*tiny_run.arguments, "--out", str(folder), "--resume"]
     kept: dict[str, int] = {}
@@ -277,7 +277,7 @@ def test_unfinished_stage_is_repeated(tiny, tiny_run, tmp_path):
     "name", [*WEIGHTS, "controller/done.json", "fit/done.json", "collect/trajectories.npz", "model/model.json"]
 )
 def test_damaged_file_is_error_with_remedy(name, tiny, tiny_run, tmp_path, capsys):
-    """Cut to half: one line says which file and what to delete, and deleting that mends it."""
+    """The file is cut in half. The error names the file and what to delete; deleting it helps."""
     folder = copy(tiny_run, tmp_path)
     if not name.startswith("model/"):
         shutil.rmtree(folder / "model")
@@ -316,7 +316,7 @@ def test_invalid_pairs_are_error(changes, tmp_path, tiny_settings):
 )
 @pytest.mark.parametrize("value", [None, [], {}, "x" * 3, [1], True])
 def test_invalid_rows_are_error(name, value, tiny_run, tmp_path, tiny_settings):
-    """A row left by an interrupted evaluation, and those of a finished one."""
+    """The row of an interrupted evaluation, and the rows of a finished one."""
     rows = pipeline.results(tiny_run.folder)
     row = rows[0] | {name: value}
     if value is None:
@@ -336,7 +336,7 @@ def test_invalid_rows_are_error(name, value, tiny_run, tmp_path, tiny_settings):
 
 @pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "target": 3}, {"maze": 9}])
 def test_trajectories_of_other_run_are_error(changes, toy_data, tiny_run, tiny_settings, tmp_path):
-    """Of another robot, or of mazes that this run has not."""
+    """Trajectories of another robot, or of mazes that do not belong to the run."""
     folder = copy(tiny_run, tmp_path)
     data = toy_data([3, 4])
     wider = {name: np.repeat(getattr(data, name)[..., :1], n, -1) for name, n in changes.items() if name != "maze"}
@@ -432,14 +432,14 @@ def test_all_stages_run_without_jit(jit_disabled, tmp_path, tiny_settings, monke
         prm=change(tiny_settings.prm, samples=12),
         sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
         collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
-        rounds=0,  # a second fit; recoveries are tested so on their own
+        rounds=0,  # a round would be a second fit; recoveries have their own test without jit
         fit=fit,
         value=change(tiny_settings.value, fit=change(fit, steps=1)),
         episodes=2,
     )
 
-    # What would take minutes op by op, and is tested elsewhere: planner and explorer, a roadmap of a thousand points,
-    # and first parameters.
+    # These take minutes without jit, and have their own tests: planner and explorer, a roadmap of a thousand points,
+    # and the initial parameters.
     monkeypatch.setattr(mazes, "METHODS", ("ct",))
     for module, name in ((mazes, "draw_pairs"), (pipeline, "init_params")):
         monkeypatch.setattr(module, name, jax.disable_jit(False)(getattr(module, name)))

@@ -1,4 +1,4 @@
-"""Roadmaps: their edges are the free ones, the table holds shortest paths, plans are free, guides arrive."""
+"""Roadmaps: edges and plans are free, the table has shortest paths, and guides lead to the goal."""
 
 import functools
 
@@ -44,7 +44,7 @@ def two_rooms():
 
 
 def segment_clearances(wall_distance, walls, a, b) -> np.ndarray:
-    """Distance [m] from segments to the nearest wall, sampled: at most 2 cm more than it is."""
+    """Distance [m] from segments to the nearest wall, computed at samples; at most 2 cm too large."""
     share = np.linspace(0, 1, 301)[:, None, None]
     return wall_distance(walls, a + share * (b - a)).min(0)
 
@@ -71,7 +71,7 @@ def test_roadmap_grows_until_starts_and_goals_are_connected(walls):
     assert joins(grown, ends).all()
     np.testing.assert_array_equal(grown.points[:200], few.points)
     halved = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, config=PrmConfig(most_samples=grown.samples // 2))
-    assert not joins(halved, ends).all()  # so many were needed
+    assert not joins(halved, ends).all()  # half as many samples are not enough
 
 
 def test_roadmap_without_pairs_connects_most_points():
@@ -87,7 +87,7 @@ def test_published_number_of_samples_suffices_in_published_mazes(name, seed):
 
 
 def test_separate_regions_do_not_need_more_points():
-    ends = np.array([[[6.0, 6.0], [30.0, 6.0]]])  # in one room and in the other
+    ends = np.array([[[6.0, 6.0], [30.0, 6.0]]])  # in different rooms
     roadmap = build_roadmap(jax.random.key(0), make_maze(TWO_ROOMS), radius_m=RADIUS, config=PrmConfig(60), ends=ends)
     assert roadmap.samples == 60 and not joins(roadmap, ends).any()
 
@@ -158,7 +158,7 @@ def test_graph_has_edges_with_lengths():
 
 
 def test_points_are_uniform_over_free_area(wall_distance):
-    """Counts a quarter of a cell against the area that is clear in it."""
+    """The number of points in each quarter of a cell matches its free area."""
     walls = load_walls("antmaze-umaze")
     config = PrmConfig(samples=4000, connect_m=0.01)
     points = build_roadmap(jax.random.key(0), make_maze(walls), radius_m=RADIUS, config=config).points
@@ -208,7 +208,7 @@ def test_too_narrow_maze_is_error():
 
 @pytest.mark.parametrize(("samples", "connect_m", "pieces"), [(200, 10.0, False), (60, 6.0, True), (60, 2.0, True)])
 def test_table_has_shortest_paths(samples, connect_m, pieces):
-    """Against networkx."""
+    """Compared with networkx."""
     roadmap = roadmap_of("antmaze-large", PrmConfig(samples=samples, connect_m=connect_m))
     table, n = roadmap.table, len(roadmap.points)
     expected = np.full((n, n), np.inf)
@@ -265,7 +265,7 @@ def test_plan_between_points_of_roadmap_equals_table():
         length = path.length_m if isinstance(path, Path) else np.inf
         assert length == pytest.approx(float(roadmap.table.distance[i, j]), rel=1e-5, abs=1e-5)
         answers.add(type(path))
-    assert answers == {Path, NoPath}  # a small roadmap is of several pieces
+    assert answers == {Path, NoPath}  # a small roadmap has several components
 
 
 def test_separate_rooms_have_no_path():
@@ -292,7 +292,7 @@ def test_points_in_walls_have_no_path(bad):
 
 @functools.partial(jax.jit, static_argnames=("guide", "length"))
 def walk(guide, plan, maze, start, goal, key, noise, length):
-    """Positions [T, N, 2] of dummies that move 0.3 m to where the guide says, and ``noise`` [m] anywhere."""
+    """Positions [T, N, 2] of dummies that move 0.3 m towards their waypoints, plus random ``noise`` [m]."""
 
     def once(carry, key):
         position, plan = carry
@@ -311,7 +311,7 @@ OWN_AND_OTHER = [(PrmConfig(), 0), (SMALL, 5)]
 
 
 def guided(guide: RoadmapGuide, ends: np.ndarray, *, noise: float, length: int = 500) -> np.ndarray:
-    """Paths [T, N, 2] of dummies led from the first to the second of ``ends`` [N, 2, 2]."""
+    """Paths [T, N, 2] of dummies that are guided from the first to the second of ``ends`` [N, 2, 2]."""
     start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
     maze = jax.tree.map(lambda leaf: leaf[WHICH], stack_mazes([load_maze(name) for name in NAMES]))
     tables = stack_tables([roadmap_of(name, PrmConfig()).table for name in NAMES])
@@ -340,7 +340,7 @@ def test_padded_table_of_some_goals_guides_like_full_table(shortcut):
 
 @pytest.mark.parametrize("shortcut", [False, True])
 def test_guides_follow_plan_to_goal(wall_distance, shortcut):
-    """Two mazes and roadmaps at once; starts and goals are points of the roadmap, or of another."""
+    """For two mazes and roadmaps. Starts and goals are points of this roadmap, or of another one."""
     on, off = ([roadmap_of(name, config, seed).points for name in NAMES] for config, seed in OWN_AND_OTHER)
     ends = np.stack([(on if i < 12 else off)[which][[i, i + 20]] for i, which in enumerate(WHICH)])
     path = guided(RoadmapGuide(RADIUS, shortcut=shortcut), ends, noise=0.0)
@@ -354,7 +354,7 @@ def test_guides_follow_plan_to_goal(wall_distance, shortcut):
 
 
 def test_guides_recover_from_disturbances():
-    """Pushed 0.1 m at random at every step, now and then out of sight of the waypoint, and still arriving."""
+    """Each step has a random push of 0.1 m, sometimes out of sight of the waypoint; the goals are still reached."""
     ends = np.stack([roadmap_of(NAMES[which], PrmConfig()).points[[i, i + 30]] for i, which in enumerate(WHICH)])
     path = guided(RoadmapGuide(RADIUS), ends, noise=0.1)
     assert (np.linalg.norm(path - ends[None, :, 1], axis=-1).min(0) < 0.5).all()
@@ -362,7 +362,7 @@ def test_guides_recover_from_disturbances():
 
 @pytest.mark.parametrize("density", [1.0, 2.0, 2.5])
 def test_narrow_gaps_do_not_need_more_points(density):
-    """The robot fits through the gaps, but not with its margin: more samples would never join what they part."""
+    """The robot fits through the gaps, but not with its margin, so more samples cannot connect the two sides."""
     config = PrmConfig(samples=150, connect_m=2.0, margin_m=0.08)
     for seed in range(3):
         world = random_world(seed, 0.08 * density)

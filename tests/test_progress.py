@@ -1,4 +1,4 @@
-"""Progress and logs: what a person sees with and without a terminal, and files that stay readable."""
+"""Progress and logs: output with and without a terminal, and log files that stay readable."""
 
 import contextlib
 import io
@@ -27,7 +27,7 @@ def test_without_terminal_lines_are_printed_at_intervals(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with Bar("fit", 100) as bar:
-        for done in range(60, 101):  # resumed at 60: the 60 before took no time of this process
+        for done in range(60, 101):  # resumed at 60: the first 60 took no time in this process
             bar.update(done, "loss 0.5")
             now[0] += 1.0
     out, err = capsys.readouterr()
@@ -56,10 +56,10 @@ def test_bar_raises_pending_interrupt():
     with interruptible(), Bar("fit", 2) as bar:
         bar.update(1)
         echo = jax.jit(lambda x: jax.pure_callback(callback, jax.ShapeDtypeStruct((), np.float32), x))
-        assert float(echo(2.0)) == 2.0  # not an error of XLA
+        assert float(echo(2.0)) == 2.0  # the callback does not raise an error of XLA
         with pytest.raises(KeyboardInterrupt):
             bar.update(2)
-        bar.update(2)  # and only once
+        bar.update(2)  # it is raised only once
 
 
 def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):

@@ -1,4 +1,4 @@
-"""MuJoCo does nothing unasked: no file, no word, and no way to draw is needed to step."""
+"""MuJoCo without side effects: it writes no file, prints nothing, and needs no OpenGL for physics."""
 
 import os
 import subprocess

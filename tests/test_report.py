@@ -1,4 +1,4 @@
-"""The report: whole and self-contained, complete in what it lists, and calm about whatever a run folder lacks."""
+"""The report: it is self-contained and complete, and tolerates missing or damaged parts of a run folder."""
 
 import json
 import re
@@ -27,7 +27,7 @@ VOID = {"meta", "link", "img", "br", "hr", "input", "image", "use"}
 
 
 class Page(HTMLParser):
-    """Reads a page: its tags, its text, and whether its tags nest."""
+    """A parser of pages: tags, text, and whether the tags are nested correctly."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -57,7 +57,7 @@ class Page(HTMLParser):
 
 
 def make_episodes(seed: int, *, failures: int, n: int = 6) -> dict[str, np.ndarray]:
-    """Episodes of which the first ``failures`` stay where they are, and the others reach their goal half-way."""
+    """Episodes: the first ``failures`` do not move, and the others reach their goal after half of the horizon."""
     rng = np.random.default_rng(seed)
     start, goal = rng.uniform(4, 16, (2, n, 2)).astype(np.float32)
     success = np.arange(n) >= failures
@@ -80,18 +80,18 @@ def make_row(maze: str, method: str, success_rate: float, n: int = 6) -> dict:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The text and the page of a run with all there is."""
+    """The text and the page of a complete run."""
     return read(write_run(tmp_path_factory.mktemp("whole"), failures=(2, 5), methods=METHODS))
 
 
 @pytest.fixture
 def make_run(tmp_path):
-    """Writes a small run folder."""
+    """Write a small run folder."""
     return lambda **how: write_run(tmp_path, **how)
 
 
 def write_run(folder, *, failures=(0, 1), unseen=UNSEEN, methods=("ct",), n=6):
-    """Writes a run folder; ``failures`` are the transformer's in the seen and in the unseen maze."""
+    """Write a run folder. ``failures`` are those of the transformer in the seen and in the unseen maze."""
     mazes = {SEEN: "antmaze-umaze", unseen: "antmaze-medium"}
     texts = {name: draw_walls(load_walls(file)) for name, file in mazes.items()}
     config = {"robot": "point", "preset": "demo", "seed": 7, "command": "ct-jax train point", "commit": "abc"}
@@ -140,12 +140,12 @@ def path_figures(text: str) -> list[str]:
 
 
 def crosses(figure: str) -> int:
-    """How many failures a drawing marks."""
+    """The number of failures that a drawing marks."""
     return sum(g.count("<use") for g in figure.split("<defs>") if "fill: var(--fail)" in g)
 
 
 def assert_whole(text: str) -> Page:
-    """A page whose tags nest, and all of which are closed."""
+    """Parse a page, and check that its tags are nested and closed correctly."""
     page = Page(text)
     assert page.nested and not page.open
     return page
@@ -257,7 +257,7 @@ def everything(run):
 
 
 def strip(run):
-    """Leaves nothing but the configuration."""
+    """Delete everything except the configuration."""
     for file in everything(run):
         (run / file).unlink()
     return run
@@ -337,7 +337,7 @@ def test_too_large_number_is_ignored(make_run):
 
 @pytest.mark.parametrize("kind", ["U3", "c16", "f4"])
 def test_invalid_arrays_are_ignored(make_run, kind):
-    """Of the roadmap and of episodes, one after the other."""
+    """Arrays of the roadmap and of episodes, one at a time."""
     run = make_run()
     points, edges = np.zeros((3, 2)), np.array([[0, 1], [1, 2]])
     for name, changed in (("points", points.astype(kind)), ("edges", edges.astype(kind)), ("edges", np.arange(3))):
@@ -472,7 +472,7 @@ def test_paths_of_any_length_are_drawn(n, steps):
     draw_paths(ax, path, np.arange(n) % 2 == 0, np.full(n, steps), path[0], path[0] + 1)
     assert "<path" in pictures.to_svg(figure, "paths")
     marked = [len(points.get_offsets()) for points in ax.collections if isinstance(points, PathCollection)]
-    assert marked == [n, n, n // 2][: 2 + (n > 1)]  # starts, goals and the ends of failures, however short the ways
+    assert marked == [n, n, n // 2][: 2 + (n > 1)]  # starts, goals and ends of failures, also for short paths
 
 
 def test_resampling_keeps_path_and_ends():

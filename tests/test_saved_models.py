@@ -1,5 +1,5 @@
-"""What a folder of a model says is not believed: 2,000 mutations of descriptions and weights, none of which gives a
-traceback, is taken out of its range, or changes what a model does.
+"""The files of a model are validated: 2,000 mutations of descriptions and weights. None of them causes a traceback, is
+accepted outside its range, or changes the function of a model.
 """
 
 import copy
@@ -41,14 +41,14 @@ SETTINGS = Settings(
 
 
 def examples(n):
-    """So many of them, the same in every run."""
+    """A number of examples, the same in every run."""
     return settings(
         max_examples=n, derandomize=True, database=None,
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )  # fmt: skip
 
 
-# Nothing that a setting may be, and much that only some may be.
+# Values that no setting or only some settings accept.
 NASTY = [
     None, True, False, -5, -1, 0, 1, 2, 3, 4, 99, 10**9, 2**31, 2**64, 10**400, 0.0, 0.5, 1.0, 2.0, 3.0, -0.5, 1e300,
     float("nan"), float("inf"), "", "1", "3", "x", "ab", "world", "heading", "sideways", "own", "point", "ant", "a\nb",
@@ -57,7 +57,7 @@ NASTY = [
 
 
 def places(value, path=()):
-    """Paths to everything in a JSON value but itself."""
+    """The paths to all parts of a JSON value."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, part in inside:
         yield (*path, key)
@@ -72,7 +72,7 @@ def at(value, path):
 
 @st.composite
 def mutated(draw, value):
-    """A JSON object with one to three things in it replaced, left out, added, moved or wrapped."""
+    """A JSON object with one to three parts replaced, removed, added, moved or wrapped."""
     value = copy.deepcopy(value)
     for _ in range(draw(st.integers(1, 3))):
         found = list(places(value))
@@ -97,7 +97,7 @@ def mutated(draw, value):
 
 
 def refused(load) -> bool:
-    """Whether something is refused as it should be: with a UserError of one line."""
+    """Whether loading raises a UserError of one line."""
     try:
         load()
     except UserError as bad:
@@ -110,7 +110,7 @@ def refused(load) -> bool:
 
 
 def leaves(value):
-    """The settings of a config that are no configs."""
+    """The settings of a config that are not configs."""
     if is_dataclass(value):
         return [leaf for name in value.__dataclass_fields__ for leaf in leaves(getattr(value, name))]
     return [part for entry in value for part in leaves(entry)] if isinstance(value, tuple) else [value]
@@ -119,7 +119,7 @@ def leaves(value):
 @given(mutated(json.loads(json.dumps(to_dict(SETTINGS)))))
 @examples(500)
 def test_mutated_settings_are_error_or_valid(values):
-    """What is taken is finite and moderate, of the types of the defaults, and comes back as it is."""
+    """Accepted settings are finite and moderate, have the types of the defaults, and survive a round trip."""
     found = []
     if refused(lambda: found.append(from_dict(values))):
         return
@@ -181,7 +181,7 @@ def assert_same_model(found, model):
 
 @pytest.fixture(scope="module")
 def model_json(trained, tmp_path_factory):
-    """As it was written: tests change the one in ``folder``."""
+    """The original text; tests change the file in ``folder``."""
     folder = tmp_path_factory.mktemp("unchanged")
     save_model(folder, trained)
     return json.loads((folder / "model.json").read_text())
@@ -225,10 +225,10 @@ def test_unreadable_json_is_error_of_one_line(folder, trained, where, what):
 @pytest.mark.parametrize("change", [{"heads": 1}, {"heads": 4}, {"stride": 2}, {"returns": False},
                                     {"context_acting": 4}, {"map_cell_m": 0.4}, {"commitment": 1.0}])  # fmt: skip
 def test_changed_model_with_same_shapes_is_error(folder, trained, model_json, change):
-    """Shapes do not tell these from what was saved."""
+    """The shapes of the weights are the same, but the function differs."""
     save_model(folder, trained)
     settings = model_json["settings"]
-    for number in (1, 2):  # nor does it help to say that an earlier version wrote it
+    for number in (1, 2):  # also if the file claims an earlier format
         changed = model_json | {"format": number, "settings": settings | {"model": settings["model"] | change}}
         (folder / "model.json").write_text(json.dumps(changed))
         with pytest.raises(UserError, match=r"weights\.safetensors: weights of another model"):
@@ -236,7 +236,7 @@ def test_changed_model_with_same_shapes_is_error(folder, trained, model_json, ch
 
 
 def test_files_of_earlier_versions_are_read(folder, trained, model_json):
-    """They bound weights to nothing, and said so by their format."""
+    """Their weights have no digest of the description, and their format shows it."""
     save_model(folder, trained)
     weights = folder / "weights.safetensors"
     arrays = {"transformer": trained.policy.params, "value": trained.policy.value_params}
@@ -318,7 +318,7 @@ TYPES = [np.float64, np.float16, np.int8, np.int32, np.bool_, np.uint32, np.comp
 @given(data=st.data())
 @examples(200)
 def test_wrong_arrays_with_correct_sum_are_error(weights, data):
-    """Of another type or shape, not finite, missing, or too many."""
+    """Arrays of another type or shape, arrays that are not finite, missing arrays, and additional arrays."""
     file, _ = weights
     arrays = dict(FLAT)
     name = data.draw(st.sampled_from(sorted(arrays)))

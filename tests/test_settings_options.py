@@ -1,4 +1,4 @@
-"""Every setting of the method is an option of ``ct-jax train``, and ends in the run's settings."""
+"""Every setting of the method is an option of ``ct-jax train``, and is stored in the settings of the run."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from ct_jax.settings import Settings, to_dict
 
 @pytest.fixture
 def settings_of(monkeypatch, tmp_path):
-    """The settings of the run that a command line would train."""
+    """A function from command line arguments to the settings of the run."""
 
     def settings_of(*arguments: str) -> Settings:
         runs = []

@@ -1,4 +1,4 @@
-"""What the sources themselves must keep to: imports go one way, functions are short, nothing is unpickled."""
+"""Rules for the sources: imports go one way, functions are short, and nothing is unpickled."""
 
 import ast
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import pytest
 import ct_jax
 
 ROOT = Path(__file__).parents[1]
-# Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
+# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here.
 ORDER = [
     *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "progress"],
     *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
@@ -19,14 +19,14 @@ ORDER = [
     *["baselines", "transfer", "settings", "presets", "model", "run"],
     *["report", "mazes", "rooms", "pipeline", "cli"],
 ]
-USERS = {"experiments", "benchmarks", "tests"}  # of the packages: no package knows of them
+USERS = {"experiments", "benchmarks", "tests"}  # no package may import them
 LEARNING = {"optax", "orbax", "flax.linen", "flax.nnx", "flax.training", "brax.training", "tensorboardX"}
 PICKLERS = {"pickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "brax.io.model"}
 LONGEST = 80  # lines of a function
 
 
 def sources(folder: str) -> dict[str, Path]:
-    """Files of a folder by the name they are imported by; a package's ``__init__`` bears the package's."""
+    """The files of a folder by their import names. ``__init__`` has the name of its package."""
     top = ROOT / ("envs" if folder == "ct_envs" else "")
     files = sorted((top / folder).rglob("*.py"))
     return {".".join(file.relative_to(top).with_suffix("").parts).removesuffix(".__init__"): file for file in files}
@@ -37,7 +37,7 @@ SHIPPED = PACKAGES | sources("experiments") | sources("benchmarks")
 
 
 def imports(text: str, module: str, *, package: bool = False) -> Iterator[str]:
-    """Everything imported anywhere in a source, with the names taken: "ct_jax.prm.Roadmap"."""
+    """All imports in a source, with the imported names, such as "ct_jax.prm.Roadmap"."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -53,18 +53,18 @@ def imports_of(module: str) -> set[str]:
 
 
 def within(name: str, modules: set[str]) -> bool:
-    """Whether a dotted name is one of the modules, or inside one."""
+    """Whether a dotted name is one of the modules, or is inside one of them."""
     return any(name == module or name.startswith(module + ".") for module in modules)
 
 
 def rank(module: str) -> int:
-    """Place of a module of ct_jax in the order; -1 for the package itself."""
+    """The position of a module of ct_jax in the order; -1 for the package itself."""
     stage = [*module.split("."), ""][1]
     return ORDER.index(stage) if stage else -1
 
 
 def later_stages(text: str, module: str, *, package: bool = False) -> list[str]:
-    """Imports of ct_jax that a module of it must not make: of later stages, or of public names, which hide theirs."""
+    """The forbidden imports of a module of ct_jax: later stages, and public names, which hide the stages."""
     names = [name for name in imports(text, module, package=package) if within(name, {"ct_jax"})]
     stages = [name for name in names if name.split(".")[1:2] and name.split(".")[1] in ORDER]
     public = [name for name in names if name.split(".")[1:2] and name.split(".")[1] in ct_jax.__all__]
@@ -72,7 +72,7 @@ def later_stages(text: str, module: str, *, package: bool = False) -> list[str]:
 
 
 def at_import(text: str) -> str:
-    """A source without what only type checkers read."""
+    """A source without the code for type checkers."""
 
     class Runs(ast.NodeTransformer):
         def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
@@ -88,7 +88,7 @@ def long_functions(text: str) -> list[str]:
 
 
 def unpicklings(text: str, module: str = "") -> list[str]:
-    """Imports of picklers, and calls that would let NumPy unpickle."""
+    """Imports of pickle modules, and calls that allow NumPy to unpickle."""
     calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
     keywords = (keyword for call in calls for keyword in call.keywords if keyword.arg == "allow_pickle")
     allowed = [k.arg for k in keywords if not (isinstance(k.value, ast.Constant) and k.value.value is False)]
@@ -119,7 +119,7 @@ def test_stages_import_only_earlier_stages(module):
     assert not stage or stage in ORDER, f"give {stage} its place in ORDER"
     file = SHIPPED[module]
     text = file.read_text("utf-8")
-    text = text if stage else at_import(text)  # the package itself names stages for type checkers, and imports none
+    text = text if stage else at_import(text)  # the package imports stages for type checkers only
     assert not later_stages(text, module, package=file.name == "__init__.py")
 
 

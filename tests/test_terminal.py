@@ -1,4 +1,4 @@
-"""What reaches the terminal cannot command it, whatever it shows, and whatever it can show."""
+"""Output to a terminal has no control characters, and works on terminals with any encoding."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ from ct_jax.progress import Bar
 from ct_jax.terminal import one_line, printable, show_anything
 
 ROOT = Path(__file__).parents[1]
-EVIL = "\x1b]0;mine\x07\x1b[31m[/red]:smile:\u202e\n"  # to rich, too
+EVIL = "\x1b]0;mine\x07\x1b[31m[/red]:smile:\u202e\n"  # also markup of rich
 ROW = {
     "method": "ct", "success_rate": 0.5, "success_ci95": [0.25, 0.75], "spl": 0.5, "return_scaled": -1.0,
     "collision_rate": 0.0, "steps_mean": 3.0,
@@ -112,7 +112,7 @@ def test_ascii_terminal_shows_similar_characters(arguments):
 
 @pytest.mark.parametrize("arguments", [["mazes"], ["--version"], ["--help"], ["evaluate", "zoo:point", "--json"]])
 def test_full_device_is_error_of_one_line(arguments):
-    """Before anything is evaluated, which would take longer than this test may."""
+    """The error comes before the evaluation, which would take longer than this test."""
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     with open("/dev/full", "w") as full:
         done = subprocess.run(

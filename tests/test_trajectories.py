@@ -1,4 +1,4 @@
-"""Trajectories: nothing is lost on the way from the record of an episode to a window of it."""
+"""Trajectories: from recorded episodes to training windows without loss."""
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +69,7 @@ def windows(data: Trajectories, seed: int = 0, **options):
 
 
 def which_step(window, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Trajectory and step [B, S] that pieces are of; after the end of a short one, of its last step."""
+    """Trajectory and step [B, S] of windows. After the end of a short trajectory, it is the last step."""
     i = np.asarray(window.proprio)[:, :1, 0].astype(int)
     return np.broadcast_to(i, window.valid.shape), np.asarray(window.proprio)[..., 1].astype(int)
 
@@ -100,11 +100,11 @@ def test_window_is_part_of_trajectory(toy_data, stride):
         np.testing.assert_array_equal(getattr(window, name)[inside], getattr(data, name)[i, t][inside], err_msg=name)
     np.testing.assert_array_equal(np.asarray(window.rtg)[inside], np.asarray(data.rtg)[i, t][inside])
     assert not np.asarray(window.label_mask)[~inside].any()
-    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones are cut
+    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones
 
 
 def test_single_steps_are_drawn_uniformly(toy_data):
-    """A chi-square test on all steps of the data, with a fixed seed; padding is never drawn."""
+    """A chi-square test over all steps of the data, with a fixed seed. Padding is never drawn."""
     data = toy_data([3, 0, 17, 40])
     counts = np.zeros(data.reward.shape)
     for seed in range(3):
@@ -157,27 +157,27 @@ def test_eight_symmetries_are_a_group(toy_data):
     names = ("map", "proprio", "goal_relative", "action", "label")
 
     def index(window) -> int:
-        """Which image a window is; there must be one."""
+        """The index of the symmetry that gives a window."""
         equal = [all(np.array_equal(getattr(window, n), getattr(image, n)) for n in names) for image in images]
         assert sum(equal) == 1
         return equal.index(True)
 
-    assert [index(image) for image in images] == list(range(8))  # all differ
+    assert [index(image) for image in images] == list(range(8))  # all are different
     table = np.array([[index(mirror_windows(jnp.array([s]), GROUP, image)) for image in images] for s in range(8)])
     for line in (*table, *table.T):
-        assert sorted(line) == list(range(8))  # closed, and each can be undone
+        assert sorted(line) == list(range(8))  # closed, with inverses
     assert (table[0] == np.arange(8)).all()
     assert (table != table.T).any()  # rotations and reflections do not commute
 
 
 def element(bits: int) -> int:
-    """Number in the group of: swap x and y (bit 0), then flip x (bit 1), then flip y (bit 2)."""
+    """Index in the group for: swap x and y (bit 0), then flip x (bit 1), then flip y (bit 2)."""
     world = np.diag([1.0 - (bits & 2), 1.0 - (bits >> 1 & 2)]) @ (np.eye(2)[::-1] if bits & 1 else np.eye(2))
     return int(np.flatnonzero((GROUP.world == world).all((1, 2)))[0])
 
 
 def turn_world(symmetry: int, mazes, data: Trajectories):
-    """The same episodes in a mirrored world, from nothing but what each bit is said to mean."""
+    """The same episodes in a mirrored world, computed from the definition of the bits."""
     side = mazes.shape[0] * 4.0
     walls, centre = np.asarray(mazes.walls), np.float32(side / 2)
     points = {"position": np.asarray(data.position) - centre, "goal_world": np.asarray(data.goal_world) - centre}
@@ -195,7 +195,7 @@ def turn_world(symmetry: int, mazes, data: Trajectories):
 
 @pytest.mark.parametrize("symmetry", range(8))
 def test_mirrored_window_equals_window_of_mirrored_world(toy_data, symmetry):
-    """Positions on a grid of 1/64 m and map cells of 3/4 m: every sum is exact, so equality is, too."""
+    """Positions on a grid of 1/64 m and map cells of 3/4 m make all sums exact, so that windows can be equal."""
     mazes = stack_mazes([make_maze(random_walls(seed, height=12, width=12, density=0.7)) for seed in range(3)])
     data = toy_data([20, 9], mazes=3, side_m=48.0, seed=symmetry)
     data = data.replace(
@@ -252,7 +252,7 @@ def test_damaged_file_is_error(toy_data, tmp_path, damage):
 
 
 def damaged(arrays, draw):
-    """Arrays of trajectories with one of them changed into what it may not be."""
+    """Arrays of trajectories; one of them has an invalid value."""
     name = draw(st.sampled_from(sorted(arrays)))
     array = arrays[name]
     match draw(st.sampled_from(["missing", "type", "axis", "cut", "value"])):
@@ -313,7 +313,7 @@ def test_padding_in_file_is_ignored(toy_data, tmp_path):
 
 @pytest.mark.parametrize("steps", [(2, 40, 300), (64, 65, 2), (7, 7, 7)])
 def test_joining_keeps_everything(toy_data, steps):
-    """Whatever the padding of the parts: it may be cut, but no step is."""
+    """For any padding of the parts. Padding may be cut, but steps are not."""
     parts = [toy_data([1, n // 2, n], seed=n, steps=n + extra) for n, extra in zip(steps, (0, 9, 400), strict=True)]
     whole = concatenate(parts)
     assert whole.n == 9
@@ -357,7 +357,7 @@ def test_window_is_the_same_without_jit(toy_data):
 
 @pytest.fixture
 def kept(toy_data):
-    """Makes trajectories that keep the maps and goals of their steps, which here say which step it is."""
+    """Make trajectories with stored maps and goals, which contain the index of the step."""
 
     def make(lengths):
         data = toy_data(lengths)
@@ -392,7 +392,7 @@ def test_stored_maps_survive_saving_padding_and_joining(kept, tmp_path):
 
 
 def test_mirrored_turtlebot3_swaps_left_and_right(kept):
-    """Its own frame: rows of the map run to the left, so they are reversed, and only what points sideways changes."""
+    """In its own frame, rows of the map run to the left, so they are reversed. Only sideways components change."""
     data, _ = kept([30])
     group = symmetries(ROBOTS["turtlebot3"])
     assert len(group.world) == 2

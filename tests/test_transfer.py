@@ -1,4 +1,4 @@
-"""Transfer: the trunk is the old robot's, the body the new one's, and nothing else is mixed up."""
+"""Transfer: the trunk comes from the old robot's model, and the body from the new robot's."""
 
 import sys
 from dataclasses import replace
@@ -40,7 +40,7 @@ def test_trunk_is_transferred_and_body_is_new(proprio, actions, frame):
 
 
 def test_trunk_with_and_without_action_inputs():
-    """What becomes of past actions is the body's."""
+    """The embedding of past actions belongs to the body."""
     blind, seeing = params(0, 2, 2, actions=False), params(1, 27, 8)
     assert "embed_action" not in transfer(seeing, blind)["params"]
     moved = transfer(blind, seeing)["params"]
@@ -60,7 +60,7 @@ def test_models_of_other_depths_are_error():
 
 
 def test_curve_continues_from_mark_to_mark(tiny, tiny_run, tmp_path):
-    """Two marks on the way end where one fit does, and a second call has nothing left to do."""
+    """Training with two marks ends like one training, and a second call repeats nothing."""
     options = experiment.Options(point=tiny_run.folder, ant=tiny_run.folder, episodes=4, out=tmp_path)
     target = experiment.Target.of(tiny_run.folder, 40)
     trained_in = load_maze(tiny_run.arguments[tiny_run.arguments.index("--maze") + 1])

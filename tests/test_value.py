@@ -1,4 +1,4 @@
-"""The value network: an undiscounted return that is never positive, learned from what came after."""
+"""The value network: it learns the undiscounted return, which is never positive."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ PARAMS = jax.jit(MODEL.init)(jax.random.key(0), *observations(0, 1))
 
 
 def test_predicted_return_is_never_positive():
-    """Rewards are minus distances; the network cannot promise more than none, whatever its parameters."""
+    """Rewards are minus distances. The predicted return is at most 0 for any parameters."""
     leaves, structure = jax.tree.flatten(PARAMS)
     values = []
     for seed in range(6):
@@ -60,7 +60,7 @@ def test_loss_is_squared_error_of_undiscounted_return():
 
 
 def test_value_learns_mean_return():
-    """Two kinds of states, told apart by the goal, each with returns that vary about a mean of its own."""
+    """Two kinds of states, which differ in the goal. The returns of each kind vary about their mean."""
     near, far = jnp.array([3.0, 0.0]), jnp.array([0.0, 30.0])
     maps, proprio, _ = observations(4, 64)
     which = jnp.arange(64) % 2

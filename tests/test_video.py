@@ -1,4 +1,4 @@
-"""Videos: MuJoCo draws what happened, in real time."""
+"""Videos: MuJoCo draws episodes in real time."""
 
 import os
 import resource
@@ -15,12 +15,12 @@ from ct_envs.robots import POINT, get_robot
 from ct_jax.report.video import SIZE, check_video, write_video
 
 av = pytest.importorskip("av")
-POSES = np.linspace([6.0, 6.0], [16.0, 6.0], 40, dtype=np.float32)  # of the point
+POSES = np.linspace([6.0, 6.0], [16.0, 6.0], 40, dtype=np.float32)  # poses of the point
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Where a video can be written, on a machine that can draw one."""
+    """A file for a video. The test is skipped if the machine has no OpenGL."""
     file = tmp_path / "walk.mp4"
     try:
         check_video(file)
@@ -35,7 +35,7 @@ def frames(file: Path) -> np.ndarray:
 
 
 def golden(image: np.ndarray) -> int:
-    """How many pixels are of the goal's colour."""
+    """The number of pixels with the colour of the goal."""
     red, green, blue = np.moveaxis(image.astype(int), -1, 0)
     return int(((red > 200) & (blue < 40) & (green > 150)).sum())
 
@@ -52,7 +52,7 @@ def test_video_has_duration_of_episode_and_follows_robot(file: Path, name: str):
         seconds, title = container.duration / 1e6, container.metadata["title"]
     assert images.shape[1:] == (*SIZE, 3) and title == "a walk"
     assert seconds == pytest.approx(40 * robot.control_dt_s, rel=0.03)
-    assert golden(images[0]) == 0 < golden(images[-1])  # 12 m off it is out of sight
+    assert golden(images[0]) == 0 < golden(images[-1])  # at a distance of 12 m it is out of sight
     middle = images[:, SIZE[0] // 3 : -SIZE[0] // 3, SIZE[1] // 3 : -SIZE[1] // 3].astype(int)
     assert np.abs(middle[-1] - middle[0]).max() > 50  # of the robot, at least
 
@@ -78,7 +78,7 @@ def test_full_disk_leaves_no_partial_video(file: Path):
 
 @pytest.mark.parametrize("name", ["point", "ant", "humanoid"])
 def test_floor_is_visible(file: Path, name: str):
-    """In a large room, at the lower edge of the picture, there is nothing but the floor."""
+    """In a large room, the lower edge of the picture shows only the floor."""
     robot = get_robot(name)
     model = build_model(robot)
     qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (2, 1)).astype(np.float32)
@@ -122,7 +122,7 @@ def test_invalid_opengl_variables_are_error(tmp_path: Path, monkeypatch, variabl
 
 @pytest.mark.parametrize("name", ["egl", "osmesa"])
 def test_named_opengl_backend_is_used(file: Path, monkeypatch, name: str):
-    """In a process of its own: OpenGL is loaded once. Where this way is not installed, a line says so."""
+    """In a separate process, because OpenGL is loaded once. If the backend is not installed, there is an error."""
     monkeypatch.setenv("MUJOCO_GL", name)
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     code = f"""

@@ -1,4 +1,4 @@
-"""With JAX_ENABLE_X64=1 all is as without: what is drawn, what happens, and the 32 bits in which it is kept."""
+"""JAX_ENABLE_X64=1 does not change results: random draws, episodes, and 32-bit types are the same."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ PRM = PrmConfig(samples=40)
 
 @pytest.fixture
 def both():
-    """What a function gives without 64 bits and with them; both as NumPy."""
+    """The results of a function without and with 64 bits, as NumPy arrays."""
 
     def call(function):
         found = []
@@ -42,13 +42,13 @@ def both():
 
 
 def plain(leaf):
-    """An array, of a random key its numbers."""
+    """An array; a random key becomes its numbers."""
     leaf = jnp.asarray(leaf) if not isinstance(leaf, np.ndarray) else leaf
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf)
 
 
 def assert_alike(narrow, wide, *, atol: float = 1e-4) -> None:
-    """The same numbers in the same types."""
+    """Compare numbers and types."""
     assert jax.tree.structure(narrow) == jax.tree.structure(wide)
     for (path, a), b in zip(jax.tree.leaves_with_path(narrow), jax.tree.leaves(wide), strict=True):
         a, b = plain(a), plain(b)
@@ -78,7 +78,7 @@ def few(maze):
 
 
 def happened(maze, method, **who):
-    """The episodes of a method in the first 60 steps, its pairs included."""
+    """The episodes of a method in the first 60 steps, with their pairs."""
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=60)
     done = evaluate(env, maze, few(maze), method, prm=PRM, **who)
     names = ("success", "collided", "fell", "timeout", "steps", "returns", "travelled_m", "path", "asked")
@@ -104,13 +104,13 @@ def transformer(clip_target_return: bool = False) -> TransformerPolicy:
 
 
 def test_transformer_does_not_depend_on_x64(both):
-    policy = jax.device_get(transformer(clip_target_return=True))  # as a shipped model's: drawn without 64 bits
+    policy = jax.device_get(transformer(clip_target_return=True))  # drawn without 64 bits, like a shipped model
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), "ct", policy=policy)), atol=1e-2)
 
 
 @pytest.mark.parametrize("options", [{}, {"relabel": 0.5, "mirror": True, "chain": True, "turn_ramp": (0.2, 0.6)}])
 def test_sac_does_not_depend_on_x64(both, options):
-    """What is kept has the same types, and the random beginning is the same; brax's own draws differ afterwards."""
+    """The state has the same types, and the initial values are the same. Later draws of brax differ."""
     config = SacConfig(envs=4, iterations=8, updates=1, warmup=2, batch=8, hidden=(8,), replay=64, episode_steps=4)
     robot = ANT if options else POINT
     maze = load_maze("antmaze-umaze")
