@@ -68,7 +68,7 @@ def empty(n: int, steps: int) -> Trajectories:
     shapes = {"position": 2, "proprio": 2, "action": 2, "label": 2, "reward": 0, "label_mask": 0, "collision": 0}
     arrays = {name: np.zeros((n, steps, size) if size else (n, steps), np.float32) for name, size in shapes.items()}
     counts = {name: np.zeros(n, np.int32) for name in ("maze", "length")}
-    return Trajectories(**arrays, **counts, goal=np.zeros((n, 2), np.float32))
+    return Trajectories(**arrays, **counts, goal_world=np.zeros((n, 2), np.float32))
 
 
 def train() -> dict[str, np.ndarray]:
