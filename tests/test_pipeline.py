@@ -276,7 +276,7 @@ def test_unfinished_stage_is_repeated(tiny, tiny_run, tmp_path):
 @pytest.mark.parametrize(
     "name", [*WEIGHTS, "controller/done.json", "fit/done.json", "collect/trajectories.npz", "model/model.json"]
 )
-def test_damaged_file_is_error_with_remedy(name, tiny, tiny_run, tmp_path, capsys):
+def test_damaged_file_is_named_with_remedy(name, tiny, tiny_run, tmp_path, capsys):
     """The file is cut in half. The error names the file and what to delete; deleting it helps."""
     folder = copy(tiny_run, tmp_path)
     if not name.startswith("model/"):
@@ -334,7 +334,7 @@ def test_invalid_rows_are_error(name, value, tiny_run, tmp_path, tiny_settings):
             pipeline.results(tmp_path)
 
 
-@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "target": 3}, {"maze": 9}])
+@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "label": 3}, {"maze": 9}])
 def test_trajectories_of_other_run_are_error(changes, toy_data, tiny_run, tiny_settings, tmp_path):
     """Trajectories of another robot, or of mazes that do not belong to the run."""
     folder = copy(tiny_run, tmp_path)
