@@ -18,7 +18,7 @@ help: ## List the targets
 
 setup: $(READY) ## Create .venv with the locked packages and this project in it
 
-# The stamp lies inside .venv, so that deleting .venv is enough to start afresh.
+# The stamp is in .venv, so that deleting .venv is enough to start again.
 $(READY): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11 or newer found; name one with PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@"$(PYTHON)" -c '$(NEW_ENOUGH)' 2>/dev/null || { echo "error: $(PYTHON) does not run, or is older than Python 3.11" >&2; exit 1; }
@@ -39,7 +39,7 @@ test: setup ## Run the tests (ARGS="-k maze" to choose, WORKERS=8 for more proce
 	@echo "Running the tests in $(WORKERS) processes"
 	@$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
-test-resume: setup ## Kill runs twenty times; each must end like one that nothing stopped (minutes)
+test-resume: setup ## Kill runs twenty times; their results must equal those of uninterrupted runs (minutes)
 	@$(BIN)/python -m pytest -m long $(ARGS) tests/test_resume.py tests/test_compilation.py
 
 check: setup ## Lint, check the formatting and the types
@@ -50,11 +50,11 @@ check: setup ## Lint, check the formatting and the types
 	@echo "pyright: types"
 	@$(BIN)/pyright
 
-format: setup ## Format the code and mend what the linter can mend
+format: setup ## Format the code and apply the linter's fixes
 	@$(BIN)/ruff check --fix-only .
 	@$(BIN)/ruff format .
 
-# The commit is asked for once: the results that each benchmark writes are no change of the code.
+# Determine the commit once, because the results of a benchmark would make it dirty.
 bench: setup ## Run every benchmark (12 minutes on 2 cores); peers: .venv/bin/pip install -e '.[bench]'
 	@export BENCH_COMMIT="$$(git describe --always --dirty 2>/dev/null)"; for script in $(filter-out benchmarks/scale.py,$(sort $(wildcard benchmarks/[a-z]*.py))) benchmarks/scale.py experiments/pages.py; do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
@@ -65,7 +65,7 @@ docs: setup ## Build the pages of docs/ as a site in site/; broken links and anc
 	@$(BIN)/zensical build --strict
 	@echo "Open site/index.html"
 
-# pip-tools lives in an environment of its own, so that it can neither be locked nor disturb what is.
+# pip-tools has its own environment, so that it is not locked and does not disturb locked packages.
 lock: ## Remake requirements.lock (needs Python 3.11 on Linux x86-64)
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { echo "error: the lock is made with Python 3.11; name one with PYTHON=" >&2; exit 1; }
 	@test -x .make/lock/bin/pip-compile || { "$(PYTHON)" -m venv --clear .make/lock && .make/lock/bin/python -m pip -qq --disable-pip-version-check install $(PIP_TOOLS); }

@@ -1,5 +1,5 @@
-"""Hugging Face's Decision Transformer in torch, with our map encoder and goal embedding in front: the peer of
-``transformer.py`` and ``acting.py``. Importing it needs torch and transformers."""
+"""The peer of ``transformer.py`` and ``acting.py``: Hugging Face's Decision Transformer (torch), with our map encoder
+and goal embedding as inputs. Importing this module needs torch and transformers."""
 
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
@@ -36,7 +36,7 @@ class PeerTransformer(nn.Module):
         self.to(DEVICE)
 
     def forward(self, batch: Batch) -> torch.Tensor:
-        """Actions [B, S, A] of pieces of trajectories."""
+        """Actions [B, S, A] for windows of trajectories."""
         goal, maps = batch["goal_relative"], batch["map"].float()
         distance = goal.norm(dim=-1, keepdim=True)
         features = torch.cat([goal / GOAL_SCALE_M, torch.tanh(goal / 2.0), goal / (distance + 0.1)], -1)
@@ -54,14 +54,14 @@ def batch_of(**arrays: np.ndarray) -> Batch:
 
 
 class PeerTraining:
-    """Its training on one batch that lies ready: AdamW, clipped gradients."""
+    """Training of the peer on one prepared batch, with AdamW and gradient clipping."""
 
     def __init__(self, model: PeerTransformer, batch: Batch, *, bf16: bool = False):
         self._model, self._batch, self._bf16 = model.train(), batch, bf16
         self._optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, weight_decay=1e-3)
 
     def train(self, updates: int) -> None:
-        """Some updates."""
+        """Run a number of updates."""
         for _ in range(updates):
             with torch.autocast(DEVICE, torch.bfloat16, enabled=self._bf16):
                 error = (self._model(self._batch) - self._batch["label"]).float() ** 2
@@ -75,13 +75,13 @@ class PeerTraining:
 
 @torch.no_grad()
 def act(model: PeerTransformer, batch: Batch) -> torch.Tensor:
-    """The last action of each window, everything recomputed, as Hugging Face's own example acts."""
+    """The last action of each window. The whole window is recomputed, as in Hugging Face's example."""
     action = model.eval()(batch)[:, -1]
     finish()
     return action
 
 
 def finish() -> None:
-    """Wait for the device."""
+    """Wait until the device has finished."""
     if DEVICE == "cuda":
         torch.cuda.synchronize()

@@ -1,7 +1,7 @@
-"""What all benchmarks share: contestants timed in turn, a printed table, and ``benchmarks/results/NAME.json``.
+"""The common part of all benchmarks: timing contestants in turn, a printed table, and ``benchmarks/results/NAME.json``.
 
-Results of an accelerator have a file of their own, ``NAME-gpu.json``. ``python experiments/pages.py`` writes all of
-them to ``docs/speed.md``.
+Results of an accelerator are in a separate file, ``NAME-gpu.json``. ``python experiments/pages.py`` writes all results
+to ``docs/speed.md``.
 """
 
 import importlib.util
@@ -33,35 +33,35 @@ from ct_jax.run import provenance
 RESULTS = Path(__file__).parent / "results"
 PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")
 _WIDTH = 116
-_FEWEST = 2  # rounds of a race
-COMMIT = "BENCH_COMMIT"  # variable in which ``make bench`` names the commit: new results are no change of the code
+_FEWEST = 2  # minimum number of rounds
+COMMIT = "BENCH_COMMIT"  # ``make bench`` sets this variable to the commit, because new results would make it "dirty"
 
 
 @dataclass(frozen=True)
 class Options:
-    """What all benchmarks can be asked."""
+    """Options of all benchmarks."""
 
     full: bool = False
-    """The long sweeps, too."""
+    """Also run the long sweeps."""
     repeat: int = 7
-    """Rounds, in each of which every contestant has its turn."""
+    """Number of rounds. Each round runs every contestant once."""
     limit_s: float = 4.0
-    """Time after which a race ends with fewer rounds than that, but at least two (--full: none)."""
+    """Time limit for the rounds [s]. At least two rounds are run. --full has no limit."""
     write: bool = True
-    """Keep the results; without it they are only printed."""
+    """Write the results to a file. Otherwise they are only printed."""
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """Something to be timed."""
+    """A function to be timed."""
 
     run: Callable[[], object]
-    work: float = 1.0  # of one call, in the unit that is counted
-    compiles: bool = True  # at its first call, which is a warm-up then
+    work: float = 1.0  # amount of work per call, in the unit of the benchmark
+    compiles: bool = True  # whether the first call compiles; it is then called once before the timing
 
 
 def has_peer(module: str, name: str) -> bool:
-    """Whether a peer is installed; says so where it is not."""
+    """Whether a peer is installed. Prints a note if it is not."""
     there = importlib.util.find_spec(module) is not None
     if not there:
         print(f"{name} is not installed, so it is not measured: pip install -e '.[bench]'")
@@ -69,9 +69,9 @@ def has_peer(module: str, name: str) -> bool:
 
 
 def time_together(*contestants: Contestant, repeat: int, limit_s: float = math.inf) -> list[list[float]]:
-    """Seconds of each, taken in turn (A B C A B C ...) after one warm-up, so that a drifting machine hurts none.
+    """Times [s] of each contestant, measured in turn (A B C A B C ...), so that a slow phase affects all.
 
-    No further round begins after ``limit_s``, once there have been two.
+    After two rounds, no further round starts once ``limit_s`` is reached.
     """
     for each in contestants:
         if each.compiles:
@@ -99,7 +99,7 @@ def _spread(values: list[float]) -> dict[str, float]:
 
 
 def command_line(main: Callable[[Any], None], options: type[Options], docstring: str | None) -> NoReturn:
-    """Run a benchmark from the command line, and end the program."""
+    """Run a benchmark from the command line, and exit."""
 
     def run() -> None:
         chosen = tyro.cli(options, description=docstring)
@@ -111,7 +111,7 @@ def command_line(main: Callable[[Any], None], options: type[Options], docstring:
 
 
 class Results:
-    """Rows of one benchmark, ``file``."""
+    """The rows of one benchmark script, ``file``."""
 
     def __init__(self, file: str, options: Options):
         self.options = options
@@ -119,16 +119,21 @@ class Results:
         if options.write:
             prepare_outputs(self.file)
         self._rows: list[dict[str, Any]] = []
-        self._made = provenance()  # before anything is written
+        self._made = provenance()  # determine the commit before any file is written
         self._made["commit"] = os.environ.get(COMMIT) or self._made["commit"]
-        keep_programs()  # what several rows share is compiled once
+        keep_programs()  # compile the programs that several rows share only once
 
     def add(
         self, name: str, unit: str, values: list[float], *, against: str = "", other: list[float] | None = None,
         ratios: list[float] | None = None, asked: float | None = None,
     ) -> None:  # fmt: skip
-        """One figure: all its values; what it stands against with its values, pair by pair the ratio, and the least
-        ratio that is asked for."""
+        """Add one row.
+
+        Args:
+            against: name of the contestant to compare with; ``other`` has its values.
+            ratios: speed ratio in each round.
+            asked: the aim: the smallest acceptable ratio.
+        """
         spread = _spread(values)
         row = {"name": name, "value": spread.pop("median"), "unit": unit} | spread | {"against": against}
         row |= {"other": statistics.median(other) if other else None, "ratio": _spread(ratios) if ratios else None}
@@ -138,14 +143,14 @@ class Results:
         self, name: str, unit: str, ours: Contestant, others: dict[str, Contestant] | None = None, *,
         asked: dict[str, float] | None = None,
     ) -> list[float]:  # fmt: skip
-        """Time ours and all others together: a row for each other, with how many times as fast as it ours is.
+        """Time ours and all others in turn. Adds one row for each other contestant, with the speed ratio.
 
         Args:
-            unit: "ms", "µs" or "s" for a unit of work, or of work in a second ("steps/s").
-            asked: the least such ratio, by the other's name.
+            unit: "ms", "µs" or "s" per unit of work, or work per second, such as "steps/s".
+            asked: the aims: the smallest acceptable ratios, by the name of the other contestant.
 
         Returns:
-            Our seconds.
+            The times of ours [s].
         """
         others, asked = others or {}, asked or {}
         figure = _FIGURES.get(unit, lambda seconds, work: work / seconds)
@@ -162,7 +167,7 @@ class Results:
         return times[0]
 
     def finish(self) -> None:
-        """Print the table, and keep the results."""
+        """Print the table, and write the results."""
         self._made["versions"] |= {name: metadata.version(name) for name in PEERS if _installed(name)}
         rows = [row | {"made": self._made} for row in self._rows]
         print(table_of(rows))
@@ -187,7 +192,7 @@ def table_of(rows: list[dict[str, Any]]) -> str:
     made = rows[0]["made"]
     versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
     table = Table(box=box.MARKDOWN)
-    for column in ("what", "median (min-max)", "unit", "against", "its", "times (min-max)", "asked"):
+    for column in ("what", "median (min-max)", "unit", "compared with", "its median", "ratio (min-max)", "aim"):
         table.add_column(column)
     for row in rows:
         ratio, optional = row["ratio"], lambda value: "" if value is None else _number(value)

@@ -1,11 +1,11 @@
-"""One acting step of a transformer in many environments: key/value cache against recomputing the window.
+"""One acting step of a transformer in many environments: key/value cache compared with recomputing the window.
 
     python benchmarks/acting.py [--full]
 
-Ours computes the three new tokens and looks back at cached keys and values; the window is full. Recomputing runs all 3K
-tokens again, which is how Hugging Face's Decision Transformer acts (torch; same widths, and a CNN as ours in front).
-``cpu`` is the model of that preset, ``paper`` the paper's. Sizes at which a contestant would want more memory than
-``--memory-gb``, or recomputing more than ``--recompute-steps`` tokens' states, are left out for it.
+Ours computes the three new tokens, which attend to a full window of cached keys and values. Recomputing computes all 3
+K tokens again. Hugging Face's Decision Transformer acts in this way (torch; same widths, with a CNN like ours). ``cpu``
+and ``paper`` are the models of these presets. Sizes with a cache larger than ``--memory-gb`` are left out. Contestants
+that recompute are left out if the number of environments times K is larger than ``--recompute-steps``.
 """
 
 import functools
@@ -31,19 +31,19 @@ class ActingOptions(Options):
     """Sizes of the benchmark."""
 
     presets: tuple[str, ...] = ("cpu", "paper")
-    """Whose models."""
+    """Presets of the models."""
     envs: tuple[int, ...] = (1, 100, 4096)
-    """Environments."""
+    """Numbers of environments."""
     contexts: tuple[int, ...] = (5, 50, 200)
-    """K."""
+    """Values of K."""
     memory_gb: float = 6.0
-    """Largest cache."""
+    """Maximum size of the cache [GB]."""
     recompute_steps: int = 20_500
-    """Most environments times K that are recomputed."""
+    """Maximum of the number of environments times K for recomputing."""
 
 
 def main(options: ActingOptions) -> None:
-    """Run and print."""
+    """Run the benchmark."""
     results = Results(__file__, options)
     torch = has_peer("torch", PEER) and has_peer("transformers", PEER)
     for preset in options.presets:
@@ -52,7 +52,7 @@ def main(options: ActingOptions) -> None:
         params = jax.jit(ControlTransformer(config, ACTION).init)(jax.random.key(0), *sample_inputs(PROPRIO, ACTION))
         for n in options.envs:
             for context in options.contexts:
-                # The paper's own K and the middle size, unless all are asked for.
+                # Of the paper's model, measure only its own K at 100 environments, unless --full is given.
                 if preset != "paper" or options.full or (n == 100 and context == max(options.contexts)):
                     measure(preset, params, n, context, torch, options, results)
     results.finish()
@@ -74,7 +74,7 @@ def measure(
     others = {}
     if n * context <= options.recompute_steps:
         inputs = window(n, context)
-        if options.full or preset != "paper":  # a third of a minute a call
+        if options.full or preset != "paper":  # a call of the paper's model takes 20 s
             others[RECOMPUTED] = Contestant(recomputed(model, params, inputs))
         if torch:
             others[PEER] = peer(config, inputs)
@@ -83,7 +83,7 @@ def measure(
 
 
 def window(n: int, steps: int) -> dict[str, np.ndarray]:
-    """What n environments have seen in their last steps."""
+    """Random observations of n environments in their last steps."""
     rng = np.random.default_rng(0)
     normal = lambda size: rng.normal(size=(n, steps, size)).astype(np.float32)  # noqa: E731
     return {
@@ -94,10 +94,10 @@ def window(n: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callable[[], object]:
-    """Some steps with the cache, as a rollout takes them: in one program, the cache updated in place."""
+    """A number of steps with the cache, as in a rollout: one program, and the cache is updated in place."""
     now = {name: jnp.asarray(array[:, 0]) for name, array in window(n, 1).items()}
 
-    @functools.partial(jax.jit, donate_argnums=1)  # as between the steps of a longer rollout: nothing is copied
+    @functools.partial(jax.jit, donate_argnums=1)  # the cache is not copied, as between the steps of a rollout
     def act(params, cache):
         def step(cache, _):
             action, cache = model.apply(
@@ -107,7 +107,7 @@ def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callab
 
         return jax.lax.scan(step, cache, length=steps)
 
-    # a full window: every place of the ring is in use; buffers of its own for each layer, as they are given away
+    # The window is full: all slots of the ring are in use. Each layer needs its own buffers, because they are donated.
     cache = empty_cache(model.config, ACTION, n).replace(now=jnp.array(2 * model.config.context_acting))
     held = [jax.tree.map(jnp.copy, cache)]
 
@@ -119,7 +119,7 @@ def cached(model: ControlTransformer, params: Any, n: int, steps: int) -> Callab
 
 
 def recomputed(model: ControlTransformer, params: Any, inputs: dict[str, np.ndarray]) -> Callable[[], object]:
-    """The last action of a window, all of it computed."""
+    """The last action of a window; the whole window is computed."""
     arrays = {name: jnp.asarray(array) for name, array in inputs.items()}
     arrays["maps"] = arrays.pop("map")
     act = jax.jit(lambda params, arrays: model.apply(params, **arrays)[:, -1])  # pyright: ignore
@@ -127,11 +127,11 @@ def recomputed(model: ControlTransformer, params: Any, inputs: dict[str, np.ndar
 
 
 def peer(config: ModelConfig, inputs: dict[str, np.ndarray]) -> Contestant:
-    """The peer on the same window."""
+    """The peer, on the same window."""
     from _decision_transformer import PeerTransformer, act, batch_of
 
     model, batch = PeerTransformer(config, PROPRIO, ACTION, inputs["rtg"].shape[1]), batch_of(**inputs)
-    act(model, batch_of(**{name: array[:1] for name, array in inputs.items()}))  # torch's own first call
+    act(model, batch_of(**{name: array[:1] for name, array in inputs.items()}))  # warm up torch
     return Contestant(lambda: act(model, batch), compiles=False)
 
 

@@ -2,11 +2,11 @@
 
     python benchmarks/prm.py [--full]
 
-Against two peers on the same maze. *Python loop* is the same roadmap as one would write it down with networkx: a loop
-over pairs of points, over the wall cells near each, and over the goals of the table. *OMPL* is its PRM with the
-number of samples and of neighbours that ours has on average, states checked by a Python function, as PyPI's package
-has it; it samples its edges every 0.1 m, where ours are exact, and has no table. Roadmaps are built several
-in a row, as a collection builds them.
+There are two peers on the same maze. *Python loop* builds the same roadmap with networkx and plain loops over pairs of
+points, over the wall cells near them, and over the goals of the table. *OMPL* is OMPL's PRM (the PyPI package) with the
+same number of samples, the same average number of neighbours, and a Python function that checks states. It checks its
+edges every 0.1 m, whereas ours are checked exactly, and it has no table. Several roadmaps are built in a row, as in a
+collection.
 """
 
 import math
@@ -33,19 +33,19 @@ class PrmOptions(Options):
     """Sizes of the benchmark."""
 
     samples: tuple[int, ...] = (100, 200, 1000, 5000)
-    """Points of the roadmaps."""
+    """Numbers of points of the roadmaps."""
     table_up_to: int = 1000
-    """Points up to which the table is measured (--full: all)."""
+    """Maximum number of points for the table (--full: no maximum)."""
     loop_up_to: int = 1000
-    """Points up to which the Python loop is measured (--full: all)."""
+    """Maximum number of points for the Python loop (--full: no maximum)."""
     loop_table_up_to: int = 200
-    """Points up to which its table is (--full: 1000)."""
+    """Maximum number of points for the table of the Python loop (--full: 1000)."""
     ompl_up_to: int = 1000
-    """Points up to which OMPL is measured (--full: all)."""
+    """Maximum number of points for OMPL (--full: no maximum)."""
 
 
 def main(options: PrmOptions) -> None:
-    """Run and print."""
+    """Run the benchmark."""
     results = Results(__file__, options)
     maze = load_maze("antmaze-large")
     ompl = has_peer("ompl", OMPL)
@@ -56,7 +56,7 @@ def main(options: PrmOptions) -> None:
 
 
 def building(maze: Maze, samples: int) -> Callable[[], Roadmap]:
-    """A function that builds another roadmap at each call."""
+    """A function that builds a new random roadmap at each call."""
     seeds = iter(range(10**6))
     config = PrmConfig(samples=samples)
     return lambda: build_roadmap(jax.random.key(next(seeds)), maze, radius_m=RADIUS_M, config=config)
@@ -112,7 +112,7 @@ def query(maze: Maze, samples: int, roadmap: Roadmap, planner: "OmplPlanner | No
 
 
 def growth(maze: Maze, options: PrmOptions, results: Results) -> None:
-    """How the time for an edge grows with the roadmap."""
+    """The row of the growth of the time per edge with the size of the roadmap."""
     small, large = 200, max(options.samples)
     builds = [building(maze, small), building(maze, large)]
     edges = [float(np.mean([len(build().edges) for _ in range(3)])) for build in builds]
@@ -125,7 +125,7 @@ def growth(maze: Maze, options: PrmOptions, results: Results) -> None:
 
 
 def loop_free(a: list[float], b: list[float], walls: list[list[bool]], cell: float, radius: float) -> bool:
-    """Whether a disc swept from a to b stays clear of the wall cells."""
+    """Whether a disc swept from a to b touches no wall cell."""
     low = [math.floor((min(a[i], b[i]) - radius) / cell) for i in (0, 1)]
     high = [math.floor((max(a[i], b[i]) + radius) / cell) for i in (0, 1)]
     return all(
@@ -180,7 +180,7 @@ def loop_plan(
     graph: nx.Graph, points: list[list[float]], walls: list[list[bool]], cell: float, reach: float,
     start: np.ndarray, goal: np.ndarray,
 ) -> list[Any]:  # fmt: skip
-    """A shortest path, start and goal joined to the roadmap for as long as it takes; empty if there is none."""
+    """A shortest path; empty if there is none. Start and goal are added to the roadmap for this query only."""
     graph.add_nodes_from(("start", "goal"))
     others: list[tuple[Any, list[float]]] = list(enumerate(points))
     for name, end in (("start", start.tolist()), ("goal", goal.tolist())):
@@ -215,7 +215,7 @@ class OmplPlanner:
             bounds.setLow(axis, 0.0)
             bounds.setHigh(axis, side)
         self._space.setBounds(bounds)
-        # A grid of 0.1 m, blown up by the robot's radius once: no check of a state is quicker in Python.
+        # A grid of 0.1 m with walls inflated by the robot's radius: the fastest way to check a state in Python.
         x, y = (0.1 * (np.arange(round(10 * side)) + 0.5) for side in sides)
         grid = np.stack(np.meshgrid(x, y), -1)
         clear = as_space(maze).clearance(grid.reshape(-1, 2)).reshape(grid.shape[:2])
@@ -226,7 +226,7 @@ class OmplPlanner:
         self._information.setup()
 
     def build(self, samples: int) -> int:
-        """A roadmap of that many samples; returns its number of edges."""
+        """Build a roadmap with this number of samples; returns its number of edges."""
         self._prm = self._geometric.PRM(self._information)
         self._prm.setMaxNearestNeighbors(self._neighbours)
         self._prm.setProblemDefinition(self._base.ProblemDefinition(self._information))

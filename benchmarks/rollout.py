@@ -1,14 +1,14 @@
-"""Environment steps/s of ``MazeEnv`` against raw physics and against peers, and planner-guided trajectories/s.
+"""Environment steps/s of ``MazeEnv``, compared with raw physics and with peers; and planner-guided trajectories/s.
 
     python benchmarks/rollout.py [--full]
 
-Ours takes random actions under jit, as users run it; to the physics it adds walls, observations, rewards, auto-reset.
-*maps*: all observations; *proprio*: without local maps; *nothing*: none at all. The limit takes the same number of
-control steps of the same model with the same actions and does nothing else: ``mujoco.batch`` for the engine "mujoco"
-(on CPU), vmapped ``mjx.step`` for "mjx". Peers, each with an ant: Gymnasium-Robotics' and OGBench's ant mazes as they
-are run side by side, one process an environment, with as many as gives the most steps/s, and brax's own ant under vmap
-(without a maze or resets). A control step is five physics steps for all of them. *collection* is Algorithm 3 with the
-shipped controllers and the settings of the preset ``cpu``, roadmaps included.
+Ours takes random actions under jit. In addition to the physics it computes walls, observations, rewards and auto-reset.
+*maps*: all observations; *proprio*: without local maps; *nothing*: no observations. The limit is raw physics: the same
+model, number of control steps and actions, and nothing else. It is ``mujoco.batch`` for the engine "mujoco" (CPU) and
+vmapped ``mjx.step`` for "mjx". The peers have an ant, too: the ant mazes of Gymnasium-Robotics and OGBench, with one
+process per environment and the number of environments that gives the most steps/s; and brax's ant under vmap, without a
+maze or resets. A control step is five physics steps for all of them. *collection* is Algorithm 3 with the shipped
+controllers and the settings of the preset ``cpu``, including the roadmaps.
 """
 
 import importlib
@@ -32,7 +32,7 @@ from ct_jax.run import cores
 from ct_jax.worlds.mazes import MazeWorld
 
 MAZE = "antmaze-large"
-MIDDLE = 256  # environments at which all observations are compared, and peers
+MIDDLE = 256  # number of environments at which the observations and the peers are compared
 GYMNASIUM = {
     "Gymnasium-Robotics": ("gymnasium_robotics", "AntMaze_Large-v5"),
     "OGBench": ("ogbench", "antmaze-large-v0"),
@@ -44,21 +44,21 @@ class RolloutOptions(Options):
     """Sizes of the benchmark."""
 
     envs: tuple[int, ...] = (1, 64, 256, 4096)
-    """Environments (--full: every power of two)."""
+    """Numbers of environments (--full: powers of two up to 4096)."""
     robots: tuple[str, ...] = ("point", "ant")
     """Robots."""
     work: int = 25_600
-    """Control steps of a call on the quick engine, all environments together; a fiftieth of it with MJX on CPU."""
+    """Control steps per call on the fast engine, summed over the environments. MJX on CPU takes a fiftieth of them."""
     peers: bool = True
-    """Whether peers are measured."""
+    """Also measure the peers."""
     peer_envs: tuple[int, ...] = (1, 2, 4, 8, 16)
-    """Numbers of their environments that are tried."""
+    """Numbers of environments to try for the peers."""
     trajectories: int = 200
-    """Collected in a call; 0 for none."""
+    """Trajectories to collect per call. 0 leaves the collection out."""
 
 
 def main(options: RolloutOptions) -> None:
-    """Run and print."""
+    """Run the benchmark."""
     results = Results(__file__, options)
     on_cpu = jax.default_backend() == "cpu"
     envs = tuple(2**i for i in range(13)) if options.full else options.envs
@@ -77,14 +77,14 @@ def main(options: RolloutOptions) -> None:
 
 
 def steps_of(engine: str, envs: int, options: RolloutOptions) -> int:
-    """Control steps a call."""
+    """Control steps per call."""
     scale = 1.0 if engine == "mujoco" else 0.02 if jax.default_backend() == "cpu" else 40.0
     return int(np.clip(scale * options.work / envs, 5, 400))
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An environment, the actions of all steps [T, N, A], and the states before them."""
+    """An environment, the actions of all steps [T, N, A], and the initial states."""
 
     env: MazeEnv
     actions: jax.Array
@@ -96,7 +96,7 @@ class Prepared:
 
 
 def prepare(robot: str, engine: str, envs: int, options: RolloutOptions, *, maps: bool = True) -> Prepared:
-    """What a rollout needs."""
+    """Prepare the inputs of a rollout."""
     env = MazeEnv(robot, engine=engine, maze=load_maze(MAZE), maps=maps)
     shape = (steps_of(engine, envs, options), envs, env.action_size)
     actions = jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
@@ -104,14 +104,14 @@ def prepare(robot: str, engine: str, envs: int, options: RolloutOptions, *, maps
 
 
 def rollout(ready: Prepared, *, observe: bool = True) -> Contestant:
-    """All the actions in turn, compiled."""
+    """A compiled rollout over all actions."""
     step = jax.vmap(ready.env.step)
 
     @jax.jit
     def run(state: Any, actions: jax.Array) -> Any:
         def once(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
             after = step(state, action)
-            # The observations are in the carried state, so every step makes them: unless they are not carried.
+            # XLA computes the observations only if the next step gets them.
             return after if observe else after.replace(obs=state.obs), after.reward
 
         return jax.lax.scan(once, state, actions)
@@ -135,7 +135,7 @@ def raw_mujoco(ready: Prepared) -> Contestant:
 
 
 def raw_mjx(ready: Prepared) -> Contestant:
-    """The same physics steps by XLA."""
+    """The same physics steps in XLA."""
     engine = ready.env.engine
     model = mjx.put_model(engine.model)
     step = jax.vmap(mjx.step, in_axes=(None, 0))
@@ -162,7 +162,7 @@ LIMITS: dict[str, tuple[str, Callable[[Prepared], Contestant]]] = {
 
 
 def measure(robot: str, engine: str, envs: int, seen: str, options: RolloutOptions, results: Results) -> None:
-    """The row of one size, against raw physics."""
+    """The row of one size, compared with raw physics."""
     ready = prepare(robot, engine, envs, options, maps=seen == "maps")
     limit, raw = LIMITS[engine]
     asked = {}
@@ -173,7 +173,7 @@ def measure(robot: str, engine: str, envs: int, seen: str, options: RolloutOptio
 
 
 def growth(robot: str, envs: tuple[int, ...], options: RolloutOptions, results: Results) -> None:
-    """How the time for an environment's step grows with the number of environments."""
+    """The row of the growth of the time per step with the number of environments."""
     small, large = min(64, max(envs)), max(envs)
     engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     few, many = (rollout(prepare(robot, engine, n, options)) for n in (small, large))
@@ -182,7 +182,7 @@ def growth(robot: str, envs: tuple[int, ...], options: RolloutOptions, results: 
 
 
 def measure_peers(options: RolloutOptions, results: Results) -> None:
-    """The rows against other ants."""
+    """The rows of the peers."""
     others, close = {}, []
     for name, (module, task) in GYMNASIUM.items():
         if has_peer(module, name):
@@ -199,7 +199,7 @@ def measure_peers(options: RolloutOptions, results: Results) -> None:
 
 
 def make_gymnasium(module: str, task: str) -> Any:
-    """A peer's environment; runs in a process of its own."""
+    """A peer's environment; runs in its own process."""
     import gymnasium  # pyright: ignore[reportMissingImports]
 
     gymnasium.register_envs(importlib.import_module(module))
@@ -207,7 +207,7 @@ def make_gymnasium(module: str, task: str) -> Any:
 
 
 def side_by_side(module: str, task: str, options: RolloutOptions) -> tuple[Contestant, Any]:
-    """A peer with the number of processes at which it is quickest, and those."""
+    """A peer with the number of processes at which it is fastest, and its environments."""
     from gymnasium.vector import AsyncVectorEnv  # pyright: ignore[reportMissingImports]
 
     steps = max(5, options.work // MIDDLE)
@@ -237,7 +237,7 @@ def side_by_side(module: str, task: str, options: RolloutOptions) -> tuple[Conte
 
 
 def brax_ant(backend: str, ready: Prepared) -> Contestant:
-    """brax's own ant with as many environments, and the steps that take as long as they may."""
+    """brax's ant with the same number of environments. On a CPU it takes a fiftieth of the steps, to limit the time."""
     from brax.envs import get_environment
 
     env = get_environment("ant", backend=backend)

@@ -1,14 +1,13 @@
-"""The low-level controller's learner: gradient updates/s, and the time until it walks 90 % of unseen edges.
+"""SAC for the low-level controller: gradient updates/s, and the time until it succeeds on 90 % of the held-out edges.
 
     python benchmarks/sac.py [--full]
 
-The peer is Stable-Baselines3's SAC (torch) on the same environments: ours, compiled and vectorised, behind its
-``VecEnv``, with the same networks, batch, rewards and normalised inputs, at one update a step of one environment and at
-our setting (64 environments, 8 updates a step). Both are timed with all they do besides: stepping, storing, drawing.
-An episode that times out ends for the peer as one that fails: ours go on by themselves, and their last observation is
-not kept. *Products alone* is as much work as an update's, counted by XLA, in nothing but matrix products of its size,
-four that do not wait for each other: what no learner with this batch and these networks can outrun here. With --full
-the peer, too, learns until it walks 90 % of the edges.
+The peer is Stable-Baselines3's SAC (torch). Its ``VecEnv`` wraps our compiled, vectorised environments, and it has the
+same networks, batch, rewards and normalised inputs. Two settings are measured: one environment with one update per
+step, and our setting (64 environments, 8 updates per step). The times include stepping, storing and sampling. Our
+environments reset themselves and do not keep the last observation, so for the peer a time-out is the same as a failure.
+*Products alone* is an upper limit: the number of operations of an update, as counted by XLA, in matrix products of the
+same size, four of them in parallel. With --full the peer is also trained until it succeeds on 90 % of the edges.
 """
 
 import time
@@ -29,7 +28,7 @@ from ct_jax.prm import build_roadmap
 
 PEER = "Stable-Baselines3"
 PRODUCTS = "products alone"
-CHUNK = 5  # iterations between two looks at what is learned
+CHUNK = 5  # iterations between two evaluations
 
 
 @dataclass(frozen=True)
@@ -37,19 +36,19 @@ class SacOptions(Options):
     """Sizes of the benchmark."""
 
     robots: tuple[str, ...] = ("point", "ant")
-    """Robots whose updates are counted."""
+    """Robots for the updates per second."""
     updates: int = 128
-    """Updates a call."""
+    """Updates per call."""
     learner: str = "point"
-    """Robot that learns to walk edges."""
+    """Robot for the training time."""
     walks: float = 0.9
-    """Share of the held-out edges that it has to walk."""
+    """Success rate on the held-out edges at which the training ends."""
     patience_s: float = 1200.0
-    """Training time after which it is given up."""
+    """Training time after which the training is stopped [s]."""
 
 
 def main(options: SacOptions) -> None:
-    """Run and print."""
+    """Run the benchmark."""
     results = Results(__file__, options)
     peer = has_peer("stable_baselines3", PEER)
     for robot in options.robots:
@@ -63,7 +62,7 @@ def main(options: SacOptions) -> None:
 
 
 def count(ours: "Learner", flop: float, peer: bool, asked: float, options: SacOptions, results: Results) -> None:
-    """The rows of a robot's updates, each of so many operations."""
+    """The rows of a robot's updates per second; ``flop`` is the number of operations per update."""
     config = ours.sac.config
     iterations = max(1, options.updates // config.updates)
     work = float(iterations * config.updates)
@@ -76,13 +75,13 @@ def count(ours: "Learner", flop: float, peer: bool, asked: float, options: SacOp
 
 
 def update_flop(learner: "Learner") -> float:
-    """Floating-point operations of an update, as XLA counts them, by a learner with one an iteration."""
+    """Floating-point operations of an update, as counted by XLA, for a learner with one update per iteration."""
     one = jax.jit(learner.sac._updates).lower(learner.state).compile()
     return float(one.cost_analysis()["flops"])  # pyright: ignore
 
 
 def products(config: SacConfig, flop: float, updates: float) -> Contestant:
-    """So many updates' operations in matrix products of the batch with a hidden layer."""
+    """The operations of a number of updates, as matrix products of the batch with a hidden layer."""
     width = config.hidden[-1]
     layer = jax.random.normal(jax.random.key(0), (width, width)) / width**0.5
     batches = tuple(jax.random.normal(jax.random.key(1), (4, config.batch, width)))
@@ -92,7 +91,7 @@ def products(config: SacConfig, flop: float, updates: float) -> Contestant:
 
 
 def learn(peer: bool, options: SacOptions, results: Results) -> None:
-    """The row of the time until edges are walked."""
+    """The row of the training time until the success rate is high enough."""
     name = f"{options.learner}: until {100 * options.walks:.0f} % of the edges are walked"
     ours = Learner(options.learner, SacConfig())
     reached = time_to(options, ours.train, lambda: ours.success(ours.controller))
@@ -105,7 +104,7 @@ def learn(peer: bool, options: SacOptions, results: Results) -> None:
 
 
 def time_to(options: SacOptions, train: Callable[[int], Any], success: Callable[[], float]) -> float:
-    """Seconds of training until the success is high enough; looking does not count. Infinite beyond the limit."""
+    """Training time [s] until the success rate is high enough, without the evaluations; infinite beyond the limit."""
     spent = 0.0
     while success() < options.walks:
         if spent > options.patience_s:
@@ -117,7 +116,7 @@ def time_to(options: SacOptions, train: Callable[[int], Any], success: Callable[
 
 
 class Learner:
-    """Ours, on the edges of a roadmap of ``antmaze-large``."""
+    """Our learner, on the edges of a roadmap of ``antmaze-large``."""
 
     def __init__(self, robot: str, config: SacConfig):
         self.maze = load_maze("antmaze-large")
@@ -131,26 +130,26 @@ class Learner:
         self.sac.train(self.state, CHUNK)  # compiles
 
     def train(self, iterations: int) -> Any:
-        """Go on."""
+        """Train for a number of iterations."""
         self.state, report = self.sac.train(self.state, iterations)
         return jax.block_until_ready(report)
 
     @property
     def controller(self) -> SacController:
-        """What is learned so far."""
+        """The current controller."""
         config, state = self.sac.config, self.state
         return SacController(
             state.normalizer, state.average, self.env.action_size, config.hidden, config.frame, config.action_scale
         )
 
     def success(self, controller: Any) -> float:
-        """Share of the held-out edges that a controller walks."""
+        """Success rate of a controller on the held-out edges."""
         return edge_success(self._still, controller, self.maze, self._held_out, jax.random.key(1))
 
 
 @struct.dataclass
 class PeerController:
-    """The peer's policy as one of ours."""
+    """The peer's policy as a controller."""
 
     mean: jax.Array
     deviation: jax.Array
@@ -167,7 +166,7 @@ class PeerController:
 
 
 class PeerLearner:
-    """Stable-Baselines3's, on the same tasks with the same settings."""
+    """Stable-Baselines3's learner, on the same tasks with the same settings."""
 
     def __init__(self, ours: Learner):
         import torch  # pyright: ignore[reportMissingImports]
@@ -188,12 +187,12 @@ class PeerLearner:
         self.train(config.warmup)
 
     def train(self, iterations: int) -> None:
-        """Go on."""
+        """Train for a number of iterations."""
         self._sac.learn(iterations * self._envs, reset_num_timesteps=False)
 
     @property
     def controller(self) -> PeerController:
-        """What is learned so far."""
+        """The current controller."""
         actor, seen = self._sac.policy.actor, self._normal.obs_rms
         linear = [layer for layer in actor.latent_pi if hasattr(layer, "weight")] + [actor.mu]
         layers = tuple(
@@ -204,7 +203,7 @@ class PeerLearner:
 
 
 def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
-    """A learner's environments, with its observations and rewards, as the peer's ``VecEnv``."""
+    """Our learner's environments, with its observations and rewards, as a ``VecEnv``."""
     from gymnasium.spaces import Box  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
@@ -216,7 +215,7 @@ def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
         return after, sac._observe(after), sac._reward(state, action, after), after.done
 
     class Environments(VecEnv):
-        """All of them, stepped by one compiled call."""
+        """All environments; one compiled call steps them."""
 
         def __init__(self) -> None:
             size = env.proprio_size + sac.kept

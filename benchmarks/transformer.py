@@ -3,11 +3,11 @@
     python benchmarks/transformer.py [--full]
 
 *turtlebot3* is 4 layers of 128, K=5, batch 128; *ant* is 4 layers of 512, K=50, batch 64 (paper, table I). Ours is the
-step as it is trained with, in a ``scan``: windows drawn from trajectories, their maps recomputed, gradient, clipping,
-AdamW. The peer is Hugging Face's Decision Transformer in torch (same widths, batch, and a CNN as ours in front), on one
-batch that lies ready. The third contestant is a matrix product: the ratio is the share of its FLOP/s that our step
-reaches, counting XLA's count for one gradient of the loss without the drawing of windows.
-On a GPU the same in bfloat16 and with cuDNN's attention.
+training step in a ``scan``: sample windows from trajectories, compute their maps and the gradient, clip it, AdamW. The
+peer is Hugging Face's Decision Transformer in torch (same widths and batch, with a CNN like ours) on one prepared
+batch. The third contestant is a matrix product: the ratio is the FLOP/s of our step divided by those of the product.
+XLA counts the operations of our step, without the sampling of windows. On a GPU, bfloat16 and cuDNN's attention are
+measured, too.
 """
 
 from dataclasses import dataclass
@@ -35,19 +35,19 @@ class TransformerOptions(Options):
     """Sizes of the benchmark."""
 
     robots: tuple[str, ...] = ("turtlebot3", "ant")
-    """Whose paper-size models."""
+    """Robots of the models."""
     side: int = 2048
-    """Of the matrices (4 times that on an accelerator)."""
+    """Size of the square matrices (4 times as large on an accelerator)."""
     gflop: float = 100.0
-    """Work of a call, at least (100 times that on an accelerator)."""
+    """Minimum work per call [GFLOP] (100 times as much on an accelerator)."""
     preset: str = "paper"
-    """Of the models."""
+    """Preset of the models."""
     float32: bool = True
-    """Also in float32, which on a CPU is all there is."""
+    """Also measure float32 on a GPU. A CPU always uses float32."""
 
 
 def main(options: TransformerOptions) -> None:
-    """Run and print."""
+    """Run the benchmark."""
     results = Results(__file__, options)
     torch = has_peer("torch", PEER) and has_peer("transformers", PEER)
     on_gpu = jax.default_backend() == "gpu"
@@ -55,7 +55,7 @@ def main(options: TransformerOptions) -> None:
         if options.float32 or not on_gpu:
             measure(robot, "float32", "xla", torch, options, results)
         if on_gpu:
-            # cuDNN wants even numbers of tokens
+            # cuDNN needs an even number of tokens.
             for attention in ("xla", "cudnn") if robot == "ant" else ("xla",):
                 measure(robot, "bfloat16", attention, torch, options, results)
     results.finish()
@@ -74,7 +74,7 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
     draw = jax.jit(lambda key: sample_windows(
         key, data, data.rtg, mazes, batch=fit.batch, steps=fit.steps, map_cell_m=map_cell_m))  # fmt: skip
     window = draw(jax.random.key(2))
-    # of plain attention in any case: what cuDNN does inside is not counted
+    # Count the operations with plain attention, because XLA does not count those inside cuDNN.
     plain = ControlTransformer(settings.model, size, sac)
     step_flop = flop(plain, state.params, window)
     accelerator = jax.default_backend() != "cpu"
@@ -91,7 +91,7 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
 
 
 def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Trajectories:
-    """Random trajectories of the robot's sizes; a robot that drives in rooms keeps its maps."""
+    """Random trajectories with the robot's sizes. Those of a robot in rooms contain maps."""
     proprio, action = sizes(robot)
     keys = iter(jax.random.split(jax.random.key(0), 8))
     normal = lambda *more: jax.random.normal(next(keys), (n, steps, *more))  # noqa: E731
@@ -108,7 +108,7 @@ def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Traje
 
 
 def flop(model: ControlTransformer, params: Any, window: Window) -> float:
-    """Floating-point operations of one gradient of the loss, as XLA counts them for a CPU: for a GPU it does not."""
+    """Floating-point operations of one gradient of the loss. XLA counts them for a CPU, but not for a GPU."""
     gradient = jax.jit(jax.grad(transformer_loss(model)))
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (params, window, jax.random.key(0)))
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
@@ -116,14 +116,14 @@ def flop(model: ControlTransformer, params: Any, window: Window) -> float:
 
 
 def matrix_product(side: int, dtype: str, step_flop: float) -> Contestant:
-    """Square matrices multiplied, counted in training steps."""
+    """Products of square matrices. The unit of work is the number of operations of a training step."""
     a = jax.random.normal(jax.random.key(0), (side, side), jnp.dtype(dtype))
     multiply = jax.jit(lambda a: jax.lax.fori_loop(0, 4, lambda _, b: (a @ b) / side**0.5, a))
     return Contestant(lambda: multiply(a), 4 * 2.0 * side**3 / step_flop)
 
 
 def peer(config: Any, window: Window, updates: int, *, bf16: bool) -> Contestant:
-    """The peer's training on such a window."""
+    """The peer's training on this window."""
     from _decision_transformer import PeerTraining, PeerTransformer, batch_of
 
     names = ("map", "proprio", "goal_relative", "action", "label", "rtg", "timestep", "valid")

@@ -1,6 +1,6 @@
-"""What is kept on disk: Orbax for training states, safetensors for weights that are shipped. Nothing is unpickled.
+"""Files on disk: Orbax checkpoints of training states, and safetensors files of weights. Nothing is unpickled.
 
-Both carry SHA-256 sums, and are checked against them before they are trusted.
+Both have SHA-256 sums, which are checked before the files are used.
 """
 
 import hashlib
@@ -30,9 +30,9 @@ from ct_jax.terminal import printable
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0
-MANIFEST = "SHA256SUMS"  # as ``sha256sum -c`` reads it
-_COMMITTED = "commit_success.txt"  # Orbax's last word: empty of any state
-_DISK_ERRORS = {  # by what is in tensorstore's message
+MANIFEST = "SHA256SUMS"  # in the format of ``sha256sum -c``
+_COMMITTED = "commit_success.txt"  # Orbax writes it last; it contains no state
+_DISK_ERRORS = {  # by a part of tensorstore's message
     "RESOURCE_EXHAUSTED": "no space left", "No space left": "no space left", "PERMISSION_DENIED": "no permission",
     "Error writing": "writing fails",
 }  # fmt: skip
@@ -43,18 +43,23 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _disk_error(error: ValueError) -> str:
-    """What is wrong with the disk, if anything: tensorstore has one exception for all its errors."""
+    """The kind of disk error; empty for other errors. tensorstore raises the same exception for all errors."""
     return next((words for sign, words in _DISK_ERRORS.items() if sign in str(error)), "")
 
 
 def _write_manifest(folder: Path) -> None:
-    """Write the sums of all files in a folder, beside them."""
+    """Write the sums of all files in a folder into a file in that folder."""
     lines = [f"{_sum(file)}  {name}\n" for name, file in _files(folder)]
     write_text(folder / MANIFEST, "".join(lines))
 
 
 def _check_manifest(folder: Path) -> None:
-    """Raise ValueError unless every file is as it was written, none is missing and none came later, or OSError."""
+    """Check the files of a folder against its manifest.
+
+    Raises:
+        ValueError: a file is changed, missing, or not in the manifest.
+        OSError: a file cannot be read.
+    """
     lines = (folder / MANIFEST).read_text("utf-8").splitlines()
     written = {name: wanted for wanted, _, name in (line.partition("  ") for line in lines)}
     found = {name: _sum(file) for name, file in _files(folder)}
@@ -64,7 +69,7 @@ def _check_manifest(folder: Path) -> None:
 
 
 def _files(folder: Path) -> list[tuple[str, Path]]:
-    """The files of a folder with a manifest, by name, without those that are written after it."""
+    """The names and paths of the files that belong in the manifest: without those that are written after it."""
     later = (folder / MANIFEST, folder / _COMMITTED)
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file not in later)
     return [(file.relative_to(folder).as_posix(), file) for file in files]
@@ -76,7 +81,7 @@ def _sum(file: Path) -> str:
 
 
 class _Handler(ocp.StandardCheckpointHandler):
-    """Orbax's, with a manifest; it is there before the checkpoint gets its name, so that none is ever without."""
+    """Orbax's handler, with a manifest. It is written before the checkpoint gets its final name."""
 
     def finalize(self, directory: Any) -> None:
         super().finalize(directory)
@@ -94,27 +99,30 @@ class _Restore(ocp.args.StandardRestore):
 
 
 class Checkpoints:
-    """The last states of a training, in a folder of their own; a state is a pytree of arrays."""
+    """The last states of a training, in their own folder. A state is a pytree of arrays."""
 
     def __init__(self, folder: Path, *, keep: int = 2, every_s: float | None = None):
         """
         Args:
-            keep: how many states stay on disk.
-            every_s: ``maybe_save`` saves when the last save is older than this [s]; by default ``SAVE_EVERY_S``.
+            keep: number of states that are kept.
+            every_s: ``maybe_save`` saves if the last save is older than this [s]. The default is ``SAVE_EVERY_S``.
 
         Raises:
-            UserError: the folder, or one in it, is a link, or it cannot be made.
+            UserError: the folder cannot be made; or the folder, or a folder in it, is a link.
         """
         devices.first(lambda: _make_folder(folder))
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self._folder = folder.resolve()
         self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=_Handler())
         self._every_s, self._last = SAVE_EVERY_S if every_s is None else every_s, time.monotonic()
-        self._lock = threading.Lock()  # see ``rescued_by``
+        self._lock = threading.Lock()  # another thread may save, see ``rescued_by``
 
     def save(self, step: int, state: Any) -> None:
-        """Write a state and wait until it is on disk; a signal waits, too. Raises UserError if it cannot be written:
-        what was saved before stays."""
+        """Write a state, and wait until it is on disk. Signals are handled after that.
+
+        Raises:
+            UserError: the state cannot be written. Earlier states are kept.
+        """
         plain = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
         leaves = {str(i): leaf for i, leaf in enumerate(jax.tree.leaves(plain))}
         with self._lock, uninterrupted():
@@ -134,20 +142,20 @@ class Checkpoints:
             self._last = time.monotonic()
 
     def maybe_save(self, step: int, state: Any) -> None:
-        """Save if the last time is long enough ago."""
+        """Save if the last save is old enough."""
         if devices.largest(time.monotonic() - self._last >= self._every_s):
             self.save(step, state)
 
     def restore(self, like: Tree) -> tuple[int, Tree] | None:
-        """(step, state) of the newest whole checkpoint, with the structure of ``like`` and on its devices, however many
-        it was saved from; None where there is none.
+        """(step, state) of the newest undamaged checkpoint; None if there is none.
 
-        A damaged one is put aside with a warning on stderr, and the one before it is taken.
+        The state has the structure and the devices of ``like``. It may have been saved on a different number of
+        devices. A damaged checkpoint is renamed, with a warning on stderr, and the previous one is used.
         """
         for step in devices.first(lambda: sorted(self._manager.all_steps(), reverse=True)):
             folder = self._folder / str(step)
             try:
-                devices.first(lambda folder=folder: _check_manifest(folder / "default"))  # Orbax's name of the nameless
+                devices.first(lambda folder=folder: _check_manifest(folder / "default"))  # Orbax's name for the item
                 return step, self._read(step, like)
             except (ValueError, KeyError, OSError) as bad:
                 devices.first(lambda folder=folder, bad=bad: _put_aside(folder, bad))
@@ -175,7 +183,7 @@ def _make_folder(folder: Path) -> None:
 def _put_aside(folder: Path, bad: Exception) -> None:
     reason = " ".join(str(bad).split())[:200]
     print(printable(f"warning: {folder}: damaged checkpoint, going on without it ({reason})"), file=sys.stderr)
-    with suppress(FileNotFoundError):  # another process of the same training was quicker
+    with suppress(FileNotFoundError):  # another process of the same training has renamed it
         folder.rename(folder.with_name(f"damaged-{folder.name}-{time.time_ns()}"))
 
 
@@ -192,13 +200,13 @@ def run_to(
     checkpoints: Checkpoints | None,
     chunk: int,
 ) -> Tree:
-    """Train a state until it has counted to ``total``: the one loop of all trainings.
+    """Train a state up to ``total`` steps. All trainings use this loop.
 
     Args:
-        train: takes a state and a number of steps to the state after them and what to report.
-        count: how many steps a state has behind it.
-        on_progress: told (steps done, report) after every ``chunk`` steps; what the report holds are floats.
-        checkpoints: where to go on from, and where to save now and then and when interrupted.
+        train: maps a state and a number of steps to the state after these steps, and a report.
+        count: the number of steps that a state has been trained for.
+        on_progress: called with (steps done, report) after each ``chunk`` of steps. The report contains floats.
+        checkpoints: the training continues from the last checkpoint. It saves at intervals, and when interrupted.
     """
     if checkpoints is not None and (found := checkpoints.restore(state)) is not None:
         state = found[1]
@@ -212,7 +220,7 @@ def run_to(
         try:
             while done < total:
                 after, report = train(state, min(chunk, total - done))
-                report = jax.tree.map(float, report)  # waits for it: ``state`` is always one that can be saved
+                report = jax.tree.map(float, report)  # waits for the devices, so that ``state`` can always be saved
                 state, done = after, count(after)
                 on_progress(done, report)
                 if checkpoints is not None:
@@ -228,23 +236,23 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def save_weights(file: Path, tree: Any, *, of: Any = None) -> None:
-    """Write a pytree of arrays as safetensors, each leaf under its path; a reader never sees half of it.
+    """Write a pytree of arrays as a safetensors file, each leaf under its path. The file appears only when complete.
 
     Args:
-        of: what JSON says of the model that these are the weights of. A digest of it goes with them, for shapes do not
-            say which function the weights are of: of heads, or of a frame, they know nothing.
+        of: description of the model in JSON values. Its digest is stored with the weights, because the shapes of the
+            weights do not determine the model: they do not depend on the number of heads, for example.
 
     Raises:
-        UserError: a number is not finite, or the disk is full or may not be written to.
+        UserError: a number is not finite, or the file cannot be written.
     """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     arrays = {_name(path): np.asarray(leaf, order="C") for path, leaf in leaves}
     for name, array in arrays.items():
         if not _is_finite(array):
             raise UserError(f"{file}: '{name}' has become infinite or NaN in training; try a lower learning rate")
-    # One entry, for safetensors writes several in any order, and the same weights are to be the same file.
+    # The metadata has one entry, because safetensors writes several entries in random order. Files are reproducible.
     sums = [_sum_of_arrays(arrays)] + ([] if of is None else [_digest(of)])
-    content = save(arrays, metadata={"sha256": " ".join(sums)})  # its own files only their owner may read
+    content = save(arrays, metadata={"sha256": " ".join(sums)})  # ``save_file`` would ignore the umask
     with whole(file) as opened:
         opened.write(content)
 
@@ -257,7 +265,7 @@ def _sum_of_arrays(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _digest(of: Any) -> str:
-    """SHA-256 of what JSON holds, however it is written."""
+    """SHA-256 of JSON values; independent of the order of keys."""
     return hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()
 
 
@@ -269,28 +277,28 @@ def load_weights(file: Path, like: Tree, *, hint: str = "train again or fetch it
     """Read weights into the structure of ``like``.
 
     Args:
-        hint: what the error tells a person to do about a damaged file.
+        hint: the remedy in the error for a damaged file.
 
     Raises:
-        UserError: as ``read_weights`` and ``arrange_weights``.
+        UserError: see ``read_weights`` and ``arrange_weights``.
     """
     return arrange_weights(file, read_weights(file, hint=hint), like, hint=hint)
 
 
 def read_weights(file: Path, *, of: Any = None, bound: bool = True, hint: str) -> dict[str, np.ndarray]:
-    """The arrays that ``save_weights`` wrote, by name.
+    """The arrays of a file written by ``save_weights``, by name.
 
     Args:
-        of: as for ``save_weights``, if it was given there.
-        bound: whether the digest of it must be there; what earlier versions wrote has none.
+        of: the description of the model that was given to ``save_weights``, if any.
+        bound: the file must contain the digest of ``of``. Files of earlier versions do not.
 
     Raises:
-        UserError: no safetensors file, a damaged one, or the weights of another model.
+        UserError: not a safetensors file, a damaged file, or the weights of another model.
     """
     try:
         with safe_open(file, framework="np") as opened:
             found, said = {name: opened.get_tensor(name) for name in opened.keys()}, opened.metadata() or {}  # noqa: SIM118
-    # NumPy has not all of safetensors' types (AttributeError), nor as many dimensions (ValueError).
+    # NumPy lacks some types of safetensors (AttributeError), and allows fewer dimensions (ValueError).
     except (OSError, SafetensorError, AttributeError, TypeError, ValueError) as bad:
         raise UserError(f"{file}: not a whole safetensors file ({_text(bad)}); {hint}") from None
     if "sha256" not in said:
@@ -307,7 +315,7 @@ def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, hin
     """The arrays of a file in the structure of ``like``.
 
     Raises:
-        UserError: an array is missing or too many, not finite, or of another shape or type (both are shown).
+        UserError: an array is missing, unexpected, not finite, or has another shape or type.
     """
     wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(like)}
     for name, leaf in wanted.items():
@@ -327,7 +335,7 @@ def arrange_weights(file: Path, found: dict[str, np.ndarray], like: Tree, *, hin
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write JSON so that a reader never sees half of it. Raises UserError, also for numbers that JSON has not."""
+    """Write a JSON file. It appears only when complete. Raises UserError, also for infinite numbers and NaN."""
     try:
         text = json.dumps(value, indent=2, allow_nan=False)
     except ValueError:
@@ -336,7 +344,7 @@ def write_json(file: Path, value: Any) -> None:
 
 
 def read_json(file: Path, *, hint: str = "delete it and run again") -> dict[str, Any]:
-    """Read a JSON object. Raises UserError naming the file, the line and the mend."""
+    """Read a JSON object. Raises UserError with the file, the line and the remedy."""
     try:
         found = json.loads(file.read_text("utf-8"), parse_constant=_finite, parse_float=_finite)
     except FileNotFoundError:
@@ -347,7 +355,7 @@ def read_json(file: Path, *, hint: str = "delete it and run again") -> dict[str,
         raise UserError(f"{file}: not UTF-8 text; {hint}") from None
     except RecursionError:
         raise UserError(f"{file}: nested too deep to be read; {hint}") from None
-    except ValueError as bad:  # a whole number of thousands of digits, or one of ``_finite``
+    except ValueError as bad:  # an integer with thousands of digits, or an error of ``_finite``
         raise UserError(f"{file}: {str(bad).partition(';')[0]}; {hint}") from None
     except OSError as bad:
         raise UserError(f"{file}: cannot be read ({bad.strerror})") from None
@@ -357,7 +365,7 @@ def read_json(file: Path, *, hint: str = "delete it and run again") -> dict[str,
 
 
 def _finite(text: str) -> float:
-    """The number of a text. Raises ValueError if it is none: JSON has no NaN and no infinity."""
+    """Convert a text to a finite number. Raises ValueError otherwise: JSON has no NaN and no infinity."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"the number {text[:20]} is not finite")

@@ -41,37 +41,38 @@ PROGRAM = "ct-jax"
 BAD_INPUT = 2
 INTERRUPTED = 130
 ALL_SETTINGS = "--help-all"
-_stopped = False  # by a signal
+_stopped = False  # whether a signal stopped the program
 
-ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then cross mazes without one.
+ABOUT = """Robot navigation in unknown mazes: learn from a planner that knows the map, then navigate without a map.
 
 examples:
-  ct-jax mazes                                       which mazes there are
+  ct-jax mazes                                       list the named mazes
   ct-jax train point --preset demo --out runs/demo   train the point robot in minutes; writes a report
-  ct-jax evaluate runs/demo --maze unseen-rooms      try the result in a maze it has never seen
-  ct-jax COMMAND --help                              more on a command"""
+  ct-jax evaluate runs/demo --maze unseen-rooms      evaluate the model in a maze that it has never seen
+  ct-jax COMMAND --help                              help for one command"""
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Several processes, each started with the same command and the same folder."""
+    """Options for several processes. Start each of them with the same command and the same folder."""
 
     cluster: FlagCreatePairsOff[bool] = False
-    """This is one of several processes; JAX finds the others (Slurm, Open MPI, Kubernetes, Cloud TPU)."""
+    """Run as one of several processes; JAX detects the others (Slurm, Open MPI, Kubernetes, Cloud TPU)."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: none)")] = None
-    """This is one of several processes; the address of the first, which listens there and nowhere else, with any port
-    that is free there. Whoever reaches the port can join and disturb the training: keep it to hosts that you trust."""
+    """Run as one of several processes, with process 0 at this address. Process 0 listens only at this address; the port
+    must be free. Anyone who can reach the port can join and disturb the training, so restrict it to hosts that you
+    trust."""
     processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(with --coordinator)")] = None
-    """How many there are."""
+    """Number of processes."""
     process: Annotated[int | None, arg(metavar="I", help_behavior_hint="(with --coordinator)")] = None
-    """Which of them this is, from 0."""
+    """Index of this process, from 0."""
 
 
 @dataclass(frozen=True)
 class Train:
     """Train a robot end to end: roadmap, controller, trajectories, transformer, evaluation, report.
 
-    Everything goes into one folder. Ctrl-C is safe at any moment: the same command with --resume goes on.
+    Everything is written to one folder. Ctrl-C is safe at any time: the same command with --resume continues the run.
 
     examples:
       ct-jax train point --preset demo
@@ -79,42 +80,44 @@ class Train:
       ct-jax train point --maze my_floor.txt --maze hall --eval-maze my_other_floor.txt --out runs/mine
       ct-jax train ant --fit.updates 500 --model.width 256 --collect.noise 0.1
 
-    Every setting of the method can be given after ROBOT; --help-all lists them, with the values of the preset.
+    Every setting of the method is an option. `ct-jax train ROBOT --help-all` lists them with the values of the preset.
 
-    A maze file is plain text, '#' for a wall and '.' for free, closed all around; a cell is 4 m wide.
+    A maze file is plain text: '#' is a wall, '.' is free, and the border is closed. A cell is 4 m wide.
     """
 
     robot: Annotated[Positional[str], arg(metavar="ROBOT")]
-    """Robot to train: point, ant, humanoid or turtlebot3 (in PyBullet, in cluttered rooms instead of mazes)."""
+    """Robot to train: point, ant, humanoid or turtlebot3 (it uses PyBullet, and cluttered rooms instead of mazes)."""
     preset: Annotated[str, arg(metavar="demo|cpu|published|paper")] = "cpu"
-    """How much of everything: demo (minutes; walkers take longer), cpu (an hour on two cores, and one or two more for a
-    controller of one's own that walks), published (the bare method at that size) or paper (the published sizes; wants a
-    GPU)."""
+    """Size of the training: demo (minutes; longer for ant and humanoid), cpu (an hour on two cores; one or two hours
+    more if ant or humanoid learn their own controller), published (the published method at the size of cpu) or paper
+    (the published size; needs a GPU)."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/ROBOT-PRESET-SEED)")] = None
     """Run folder."""
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of everything."""
+    """Random seed of the whole run."""
     maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
-    """Maze to train in, by name or text file. By default the paper's, antmaze-large."""
+    """Training maze: a name or a text file. Repeat the option for several mazes. By default antmaze-large, as in the
+    paper."""
     eval_maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
-    """Unseen maze to evaluate in besides. By default the paper's, antmaze-large-eval."""
+    """Unseen maze for the evaluation, in addition to the training mazes. By default antmaze-large-eval, as in the
+    paper."""
     random_mazes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Collect trajectories and recoveries in so many random mazes besides."""
+    """Number of random mazes in which trajectories and recoveries are collected, in addition to the training mazes."""
     controller: Annotated[str | None, arg(metavar="own|zoo|RUN")] = None
-    """Low-level controller: learn one's own (by default; walkers' demos take zoo), take the one that ships with the
-    package, or that of another run."""
+    """Low-level controller: own trains a new one (the default, except in the demos of ant and humanoid), zoo uses the
+    one that ships with the package, and RUN uses that of another run."""
     engine: Annotated[str, arg(metavar="auto|mjx|mujoco")] = "auto"
-    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
+    """Physics engine of mazes: auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
     resume: FlagCreatePairsOff[bool] = False
-    """Continue the run in the folder: finished stages are skipped."""
+    """Continue the run in the folder. Finished stages are skipped."""
     among: Annotated[Processes, arg(name="")] = Processes()
     changes: Suppress[Fixed[tuple[str, ...]]] = ()
-    """Settings in place of the preset's, as they were given."""
+    """The options that override settings of the preset, as given."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Evaluate a trained model, or a planner with its controller, on start-goal pairs that depend on the seed only.
+    """Evaluate a trained model, or a planner with the model's controller. The seed determines the start-goal pairs.
 
     examples:
       ct-jax evaluate zoo:point --maze antmaze-large-eval
@@ -123,47 +126,47 @@ class Evaluate:
       ct-jax evaluate zoo:ant --maze unseen-spiral --episodes 20 --picture spiral.png
       ct-jax evaluate zoo:ant --maze unseen-rooms --episodes 1 --seed 3 --video rooms.mp4
       ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
-      ct-jax evaluate zoo:point --seed 7 --return_scale 0.75
+      ct-jax evaluate zoo:point --seed 7 --return-scale 0.75
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
     """Run folder, or a model that ships with the package: zoo:point, zoo:ant, zoo:humanoid or zoo:turtlebot3."""
     maze: Annotated[str | None, arg(metavar="NAME|FILE", help_behavior_hint="(default: antmaze-large)")] = None
-    """Maze by name or text file."""
+    """Maze: a name or a text file."""
     episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 100)")] = None
-    """Start-goal pairs in a maze."""
+    """Number of start-goal pairs in the maze."""
     worlds: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 20)")] = None
-    """Turtlebot3: random rooms."""
+    """Turtlebot3: number of random rooms."""
     pairs: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 25)")] = None
-    """Turtlebot3: start-goal pairs in each room."""
+    """Turtlebot3: number of start-goal pairs in each room."""
     density: Annotated[float | None, arg(metavar="F", help_behavior_hint="(default: 1)")] = None
-    """Turtlebot3: how full the rooms are, 1 as in training."""
+    """Turtlebot3: density of obstacles, relative to the training rooms."""
     noise: Annotated[float | None, arg(metavar="F", help_behavior_hint="(default: 0)")] = None
-    """Turtlebot3: errors of sensors and motion, 1 as on a real robot."""
-    horizon: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: by the longest way)")] = None
-    """Control steps of an episode. By default the robot's own (1000 for the ant), more in proportion where the longest
-    way is longer than in the paper's mazes."""
+    """Turtlebot3: errors of sensors and motion, relative to those of a real robot."""
+    horizon: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: by the longest path)")] = None
+    """Control steps of an episode. The default is the robot's horizon (1000 for the ant). If the longest path in the
+    maze is longer than in the paper's mazes, the default grows in proportion."""
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of the pairs; the same pairs for every method."""
+    """Seed of the start-goal pairs. All methods get the same pairs."""
     method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
-    """ct (the transformer), planner (knows the full map) or explorer (maps what it sees)."""
+    """ct (the transformer), planner (knows the full map) or explorer (maps what it sees, and plans on that map)."""
     return_scale: Annotated[float | None, arg(metavar="K", help_behavior_hint="(default: the model's)")] = None
-    """The transformer asks for K times the return that the value network predicts; returns are negative, so less than 1
-    asks to be quicker."""
+    """The target return is K times the return that the value network predicts. Returns are negative, so K below 1 means
+    conditioning on a higher return: faster episodes."""
     engine: Annotated[str | None, arg(metavar="auto|mjx|mujoco", help_behavior_hint="(default: auto)")] = None
-    """Physics of mazes; auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
+    """Physics engine of mazes: auto is mujoco on CPU and mjx on accelerators. On a CPU, mjx is some 30 times slower."""
     picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Draw all episodes in the maze: a .png, .svg or .pdf file."""
     video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Film the first episode in the maze: an .mp4 file."""
     json: FlagCreatePairsOff[bool] = False
-    """Print one JSON object and nothing else."""
+    """Print one JSON object, and nothing else, on stdout."""
     among: Annotated[Processes, arg(name="")] = Processes()
 
 
 @dataclass(frozen=True)
 class Report:
-    """Write report.html and report.png of a run again, from what is on disk; an unfinished run has one, too.
+    """Write report.html and report.png of a run again, from the files in its folder. The run may be unfinished.
 
     example:
       ct-jax report runs/demo
@@ -188,10 +191,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def guarded(action: Callable[[], None], *, go_on: str = "the same command continues") -> int:
-    """Run something and return its exit status; what goes wrong is told in one line on stderr.
+    """Run an action and return the exit status. An error becomes one line on stderr.
 
     Args:
-        go_on: what a person whose Ctrl-C stopped it should know.
+        go_on: the message after Ctrl-C: how to continue.
     """
     show_anything()
     go_on = printable(go_on)
@@ -202,13 +205,13 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
         return 0
     except UserError as bad:
         return _fail(bad)
-    except BrokenPipeError:  # whoever read our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed the pipe
         _close_stdout()
         return 0
     except OSError as bad:  # a full disk, no permission, ...
         _close_stdout()
         where = f"{bad.filename}: " if bad.filename else ""
-        return _fail(f"{where}{bad.strerror or bad}; make room or choose another place, what is finished is kept")
+        return _fail(f"{where}{bad.strerror or bad}; make room or choose another place; finished work is kept")
     except KeyboardInterrupt as stop:
         global _stopped
         _stopped = True
@@ -217,7 +220,7 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
 
 
 def _close_stdout() -> None:
-    """Give up on what stdout still holds, if it cannot be written: else Python would try again at its end."""
+    """Discard the buffer of stdout if it cannot be written. Otherwise Python would try again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -226,8 +229,8 @@ def _close_stdout() -> None:
 
 
 def leave(status: int) -> NoReturn:
-    """End the program. One that was interrupted ends at once: XLA may still compute something that calls Python, and
-    the two would wait for each other for ever."""
+    """End the program. An interrupted program ends at once: XLA may still run a program that calls Python, and the two
+    would wait for each other forever."""
     if not _stopped:
         sys.exit(status)
     with contextlib.suppress(OSError):
@@ -237,7 +240,7 @@ def leave(status: int) -> NoReturn:
 
 
 def entry() -> NoReturn:
-    """The program ``ct-jax``."""
+    """Entry point of ``ct-jax``."""
     leave(main())
 
 
@@ -257,7 +260,7 @@ def _fail(reason: Any) -> int:
 
 
 def _say(text: str) -> None:
-    with contextlib.suppress(OSError):  # nobody can be told that stderr cannot be written
+    with contextlib.suppress(OSError):  # an error of stderr itself cannot be reported
         print(text, file=sys.stderr, flush=True)
 
 
@@ -265,14 +268,14 @@ def _how_to_go_on(arguments: list[str]) -> str:
     if arguments[:1] != ["train"]:
         return "run it again"
     again = arguments if "--resume" in arguments else [*arguments, "--resume"]
-    return f"what is finished is kept, continue with: {shlex.join([PROGRAM, *again])}"
+    return f"finished work is kept; continue with: {shlex.join([PROGRAM, *again])}"
 
 
 # --------------------------------------------------------------------------------------------------------- parsing
 
 
 def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
-    """Parse with tyro, but say what is wrong in one line."""
+    """Parse the command line with tyro. Raises UserError with a text of one line."""
     chosen = arguments[0] if arguments else ""
 
     def brief(kind: type) -> str | None:
@@ -284,7 +287,7 @@ def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
     def parse() -> Any:
         if chosen != "train":
             return tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments)
-        # What ``Train`` does not know may be a setting of the method, whose default the preset says.
+        # An option that ``Train`` does not know may be a setting of the method. Its default comes from the preset.
         command, changes = tyro.cli(choice, prog=PROGRAM, description=ABOUT, args=arguments, return_unknown_args=True)
         return replace(command, changes=tuple(changes))
 
@@ -292,7 +295,7 @@ def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
 
 
 def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
-    """What tyro parses. Raises UserError with what it prints about mistakes, in one line, and the command to see."""
+    """Call a tyro parser. Raises UserError with tyro's error in one line, and with the help command ``see``."""
     said = io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape")
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), _unwrapped():
@@ -300,7 +303,7 @@ def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
     except SystemExit as stop:
         if not stop.code:
             with contextlib.suppress(SystemExit):
-                parse()  # once more, with the help where it belongs
+                parse()  # parse again, to print the help on the real stdout
             sys.stdout.flush()
             raise
         said.seek(0)
@@ -308,14 +311,14 @@ def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
 
 
 def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
-    """The preset's settings with those that were given in their place."""
+    """The settings of the preset, with the options of the command line in place of its values."""
     from ct_jax.settings import Settings
 
     def parse() -> Settings:
         return tyro.cli(
             AvoidSubcommands[Settings],
             prog=f"{PROGRAM} train {command.robot} --preset {command.preset}",
-            description="Every setting, with the value that the preset gives it.",
+            description="All settings, with the values of the preset.",
             default=settings,
             args=[*command.changes, *more],
         )
@@ -324,7 +327,7 @@ def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
 
 
 def _print_settings(command: Any) -> None:
-    """What ``--help-all`` shows."""
+    """Print the list of ``--help-all``."""
     if not isinstance(command, Train):
         raise UserError(f"{ALL_SETTINGS} is for: {PROGRAM} train ROBOT {ALL_SETTINGS}")
     import ct_envs.quiet  # noqa: F401
@@ -336,7 +339,7 @@ def _print_settings(command: Any) -> None:
 
 @contextlib.contextmanager
 def _unwrapped() -> Iterator[None]:
-    """Within, nobody breaks lines for the terminal's width."""
+    """A context in which no library wraps lines at the width of the terminal."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
@@ -348,23 +351,24 @@ def _unwrapped() -> Iterator[None]:
 
 
 def _reason(text: str) -> str:
-    """The gist of tyro's error box."""
+    """The message in tyro's error box, in one line."""
     gist = " ".join(re.sub(r"^╭.*╮$|[╰╯│─]", " ", text, flags=re.MULTILINE).split())
     gist = re.sub(r"(Argument helptext|For full helptext|Perhaps you meant|Available subcommands).*", "", gist)
     gist = re.sub(r"Missing from [\w -]+:", "missing:", gist).replace(" (required)", "")
     gist = re.sub(r"Expected one of {(.*)}\.", r"give a command: \1", gist)
-    gist = re.sub(r"invalid literal for int\(\) with base 10: (.*)", r"\1 is no whole number", gist.strip())
-    gist = re.sub(r"could not convert string to float: (.*)", r"\1 is no number", gist)
-    gist = re.sub(r"no type matching .*<class '(?:int|float|str)'>: ", "", gist)  # of an option that may be left out
+    gist = re.sub(r"invalid literal for int\(\) with base 10: (.*)", r"\1 is not a whole number", gist.strip())
+    gist = re.sub(r"could not convert string to float: (.*)", r"\1 is not a number", gist)
+    gist = re.sub(r"no type matching .*<class '(?:int|float|str)'>: ", "", gist)  # for an option that may be None
     gist = gist.replace("Unrecognized options:", "unknown:").replace("Error parsing ", "").strip(" .")
-    return gist or "unusable arguments"
+    return gist or "invalid arguments"
 
 
 # -------------------------------------------------------------------------------------------------------- commands
 
 
 def prepare_jax(among: Processes = Processes()) -> None:
-    """One CPU device a core, exact float32 products, compiled programs that are kept, and the other processes."""
+    """Configure JAX: one CPU device per core, exact float32 products, the cache of compiled programs, and several
+    processes if ``among`` says so."""
     _import_jax()
     import jax
 
@@ -375,31 +379,31 @@ def prepare_jax(among: Processes = Processes()) -> None:
     from ct_jax.run import cores
 
     devices.check_flags()
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs what it also raises, in hundreds of lines
-    # The fits shard their batches over devices; XLA's own threads leave much of a second core idle.
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs hundreds of lines about errors it also raises
+    # Training shards its batches over devices, because XLA's own threads leave much of a second core idle.
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={min(cores(), 8)}")
     jax.config.update("jax_default_matmul_precision", "highest")  # TF32 hurts physics and learning
     keep_programs()
     if among != Processes():
         devices.start(among.coordinator, among.processes, among.process)
     devices.start_backend()
-    # XLA has a page of doubts about each program that it did not compile itself; what fails is raised besides.
+    # XLA logs a page of warnings for each program from the cache. Real failures raise an exception as well.
     jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _import_jax() -> None:
-    """Raises UserError where JAX takes offence at its variables, or does not load."""
+    """Import JAX. Raises UserError if JAX rejects its environment variables or cannot be loaded."""
     try:
         import jax  # noqa: F401
     except Exception as bad:
-        raise UserError(f"JAX cannot be loaded ({bad}); correct the variable, or install JAX anew") from None
+        raise UserError(f"JAX cannot be loaded ({bad}); correct the variable, or reinstall JAX") from None
 
 
 def _train(command: Train) -> None:
     from ct_envs.robots import get_robot
 
     if get_robot(command.robot).course == "room":
-        _check_in_rooms(command)  # before what takes seconds
+        _check_in_rooms(command)  # before the slow imports
     _check_processes(command.among)
     check_stdout()
     prepare_jax(command.among)
@@ -419,7 +423,7 @@ def _train(command: Train) -> None:
     if command.random_mazes is not None:
         settings = replace(settings, random_mazes=_checked_count(command.random_mazes))
     if settings.controller != "own":
-        load_controller(settings.controller, command.robot)  # before a folder is made for it
+        load_controller(settings.controller, command.robot)  # check it before the run folder is made
     run = Run(
         folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
         robot=command.robot,
@@ -437,7 +441,7 @@ def _train(command: Train) -> None:
 
 
 def _checked_count(mazes: int) -> int:
-    """Raises UserError for a number of random mazes that means nothing."""
+    """The number of random mazes. Raises UserError if it is out of range."""
     from ct_jax.settings import MAX_RANDOM_MAZES
 
     if not 0 <= mazes <= MAX_RANDOM_MAZES:
@@ -446,16 +450,16 @@ def _checked_count(mazes: int) -> int:
 
 
 def _check_processes(among: Processes) -> None:
-    """Raises UserError unless the options say who this process is."""
+    """Raise UserError if the options for several processes are incomplete or contradict each other."""
     named = (among.coordinator, among.processes, among.process)
     if among.cluster:
         if any(value is not None for value in named):
-            raise UserError("--cluster finds the processes by itself; leave out --coordinator, --processes, --process")
+            raise UserError("--cluster detects all processes; leave out --coordinator, --processes and --process")
         return
     if all(value is None for value in named):
         return
     if None in named:
-        raise UserError("--coordinator HOST:PORT, --processes N and --process I go together; give all three")
+        raise UserError("--coordinator HOST:PORT, --processes N and --process I belong together; give all three")
     assert among.coordinator is not None and among.processes is not None and among.process is not None
     host, _, port = among.coordinator.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 2**16 or (":" in host and host[0] + host[-1] != "[]"):
@@ -467,7 +471,7 @@ def _check_processes(among: Processes) -> None:
 
 
 def _check_in_rooms(command: Train) -> None:
-    """Raises UserError for options that mean nothing in rooms, or where PyBullet is missing."""
+    """Raise UserError for options that do not apply to rooms, or if PyBullet is not installed."""
     from ct_envs.turtlebot3 import load_pybullet
 
     defaults = {"maze": (), "eval_maze": (), "random_mazes": None, "controller": None, "engine": "auto"}
@@ -499,14 +503,14 @@ def _evaluate(command: Evaluate) -> None:
 
 
 def _print_row(row: "Row", *, as_json: bool) -> None:
-    """Print a row at once, or on stderr if stdout cannot be written: it took long to come by."""
+    """Print a row at once. If stdout cannot be written, print it on stderr, so that a long evaluation is not lost."""
     try:
         if as_json:
             print(json.dumps(row))
         else:
             print_rows([row])
         sys.stdout.flush()
-    except BrokenPipeError:  # there may be a picture still to be drawn
+    except BrokenPipeError:  # go on: a picture may still have to be drawn
         _close_stdout()
     except OSError:
         _say(json.dumps(row))
@@ -523,7 +527,10 @@ def _stdout_as_it_is() -> Iterator[ToStdout]:
 
 @contextlib.contextmanager
 def _stdout_to_stderr() -> Iterator[ToStdout]:
-    """Whatever libraries print, C code included, goes to stderr, but for what is printed within what this yields."""
+    """A context in which all output of libraries, C code included, goes to stderr.
+
+    It yields a second context, for our own output: inside it, stdout is the real stdout.
+    """
 
     @contextlib.contextmanager
     def switched(to: int) -> Iterator[None]:
@@ -557,7 +564,7 @@ def _console(width: int | None = None) -> "Console":
 
     class Ours(Console):
         def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # for ``guarded``; rich would end the program with status 1
+            raise BrokenPipeError  # ``guarded`` handles it; rich would end the program with status 1
 
     return Ours(width=width, markup=False, emoji=False, highlight=False)
 
@@ -612,16 +619,16 @@ def print_rows(rows: list[Row]) -> None:
 
 
 def _notes(row: Row) -> Iterator[str]:
-    """What a reader of a row must know besides its figures."""
+    """Notes on a row that its numbers do not show."""
     if beyond := row.get("beyond_horizon"):
         yield (
-            f"{beyond} of {row['episodes']} pairs are farther apart than the robot goes in an episode of "
-            f"{row['horizon']} steps, and count as failures; give it more with --horizon"
+            f"{beyond} of {row['episodes']} pairs are too far apart for an episode of {row['horizon']} steps, and "
+            "count as failures; increase --horizon"
         )
     if apart := row.get("not_joined"):
-        yield f"the roadmap joins no way for {apart} of {row['episodes']} pairs, although it has all its samples"
+        yield f"the roadmap has no path for {apart} of {row['episodes']} pairs, even with the maximum number of samples"
     if straight := row.get("straight_ways"):
-        yield f"of {straight} of {row['episodes']} pairs no shortest way is known; SPL takes the straight line"
+        yield f"the shortest path of {straight} of {row['episodes']} pairs is unknown; SPL uses the straight line"
 
 
 if __name__ == "__main__":

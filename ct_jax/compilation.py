@@ -1,6 +1,6 @@
-"""Compiled programs are kept from one process to the next, in a folder that nobody else can write to.
+"""A cache of compiled programs for later processes, in a folder that only this user can write to.
 
-``JAX_COMPILATION_CACHE_DIR`` names another folder, and ``JAX_ENABLE_COMPILATION_CACHE=0`` keeps nothing.
+``JAX_COMPILATION_CACHE_DIR`` names another folder. ``JAX_ENABLE_COMPILATION_CACHE=0`` turns the cache off.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ import jax
 
 
 def keep_programs() -> None:
-    """Keep every program, however quickly it compiles: a run has hundreds. Where no private folder can be had, none."""
+    """Cache all programs, also those that compile fast: a run has hundreds. Without a private folder, cache none."""
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.values["jax_compilation_cache_dir"]:
         return
@@ -21,14 +21,14 @@ def keep_programs() -> None:
         home.mkdir(parents=True, exist_ok=True)
         folder = home / "ct-jax" / f"compiled-{_processor()}"
         private = all([_make_private(each) for each in (folder.parent, folder)])
-    except (OSError, RuntimeError):  # no home, or none that can be written to
+    except (OSError, RuntimeError):  # the home folder is missing or cannot be written
         return
     if private:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
 def _make_private(folder: Path) -> bool:
-    """Make a folder for this user alone. False where somebody else made it: compiled programs are code."""
+    """Make a folder that only this user can access. False if it belongs to another user: compiled programs are code."""
     folder.mkdir(mode=0o700, exist_ok=True)
     if folder.stat().st_uid != os.getuid():
         return False
@@ -37,7 +37,7 @@ def _make_private(folder: Path) -> bool:
 
 
 def _processor() -> str:
-    """What this processor can do, in short: machines that share a home must not share programs for the CPU."""
+    """A digest of the processor's features. Machines with different processors must not share CPU programs."""
     can = platform.machine() + platform.processor()
     info = Path("/proc/cpuinfo")
     if info.is_file():

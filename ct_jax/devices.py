@@ -1,8 +1,9 @@
 """Several devices and several processes: the mesh, the placement of arrays on it, and messages between processes.
 
-Every process runs the same program on the whole mesh. The mesh has one axis, "data". Sharded arrays are split along it
-in the order of the processes; all other arrays are whole in every process. Only process 0 writes files and decides what
-depends on files, clocks or signals: processes that decide differently would wait for each other for ever.
+Every process runs the same program on the whole mesh. The mesh has one axis, "data". Sharded arrays are split along
+this axis, in the order of the processes. All other arrays are whole in every process. Only process 0 writes files. It
+also makes all decisions that depend on files, clocks or signals: if processes decided differently, they would wait for
+each other forever.
 
 With one process, all of these functions are the identity.
 """
@@ -30,14 +31,14 @@ T = TypeVar("T")
 AXIS = "data"
 
 
-_SAID = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # variables that decide which devices there are
+_SAID = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")  # environment variables that select devices
 _PARSE_FLAGS = "from jaxlib import xla_client; xla_client.CompileOptions()"
 
 
 def check_flags() -> None:
-    """Raise UserError for XLA_FLAGS with which XLA would end the process; before anything asks JAX for its devices.
+    """Raise UserError if XLA would abort the process because of XLA_FLAGS. Call it before JAX starts devices.
 
-    Another process tries them, in a tenth of a second.
+    A subprocess parses the flags, which takes a tenth of a second.
     """
     if not (flags := os.environ.get("XLA_FLAGS")):
         return
@@ -47,10 +48,10 @@ def check_flags() -> None:
 
 
 def start_backend() -> None:
-    """Start JAX's devices. Raises UserError where they do not start."""
+    """Start JAX's devices. Raises UserError if they do not start."""
     try:
         jax.devices()
-    except Exception as bad:  # there are many kinds, an assertion without a word among them
+    except Exception as bad:  # many kinds of errors, some of them without a message
         said = " ".join(f"{name}='{os.environ[name]}'" for name in _SAID if os.environ.get(name))
         reason = " ".join(str(bad).split())[:300] or "no such platform is installed"
         hint = (
@@ -61,19 +62,19 @@ def start_backend() -> None:
 
 
 def start(coordinator: str | None, processes: int | None, process: int | None) -> None:
-    """Join the other processes; before anything else asks JAX for its devices.
+    """Join the other processes. Call it before JAX starts devices.
 
-    Process 0 listens at the coordinator's address, and at no other. Whoever reaches that port can join, read, change
-    and stop the training: there is no password and no encryption. See ``docs/security.md``.
+    Process 0 listens only at the coordinator's address. Anyone who can reach that port can join, read, change and stop
+    the training: there is no password and no encryption. See ``docs/security.md``.
 
     Args:
-        coordinator: HOST:PORT of process 0; with None, JAX finds it, and the rest, by its own cluster detection, and
-            listens at all addresses unless JAX_COORDINATOR_BIND_ADDRESS names one.
+        coordinator: HOST:PORT of process 0. If None, JAX detects the coordinator and the processes, and the
+            coordinator listens at all addresses unless JAX_COORDINATOR_BIND_ADDRESS names one.
 
     Raises:
-        UserError: no cluster is found, or the other processes are not, or the address is not one of this machine.
+        UserError: no cluster or no other process is found, or the address does not belong to this machine.
     """
-    jax.config.update("jax_enable_preemption_service", False)  # its handler of SIGTERM would take the place of ours
+    jax.config.update("jax_enable_preemption_service", False)  # it would replace our handler of SIGTERM
     listens = None if coordinator is None or process != 0 else listening_address(coordinator)
     try:
         jax.distributed.initialize(coordinator, processes, process, coordinator_bind_address=listens)
@@ -85,15 +86,15 @@ def start(coordinator: str | None, processes: int | None, process: int | None) -
 
 
 def listening_address(coordinator: str) -> str:
-    """HOST:PORT as numbers, IPv6 in brackets, where HOST may be a name.
+    """A numeric HOST:PORT (IPv6 in brackets) for a coordinator whose HOST may be a name.
 
     Raises:
-        UserError: it is no address of this machine, or somebody listens there already.
+        UserError: the address does not belong to this machine, or the port is in use.
     """
     host, _, port = coordinator.rpartition(":")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as tried:  # for gRPC would say little of what is wrong
+        with socket.socket(family, kind, protocol) as tried:  # the errors of gRPC would not say the reason
             tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind(address)
     except OSError as bad:
@@ -159,7 +160,7 @@ def feed(tree: Tree, mesh: Mesh) -> Tree:
 
 
 def alike(state: Tree) -> Tree:
-    """A state that every process computed for itself, as replicated arrays: the form in which they save it together."""
+    """A state that each process computed, as replicated arrays, so that all processes can save it together."""
     if jax.process_count() == 1:
         return state
     return place(state, replicated(data_mesh(jax.process_count())))

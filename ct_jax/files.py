@@ -1,7 +1,7 @@
-"""Every file that is written: whole or not at all, never through a link, and readable as the umask says.
+"""Writing files: complete or not at all, never through a link, and with the permissions of the umask.
 
-A run's folder may lie where others can write. So nothing that lies there decides where a file goes: a link in the place
-of a file is replaced, and a link in the place of a folder is refused.
+Other users may be able to write to a run folder. Therefore its contents must not redirect writes: a link in the place
+of a file is replaced, and a link in the place of a folder is an error.
 """
 
 import errno
@@ -18,10 +18,10 @@ import numpy as np
 from ct_envs.errors import UserError
 
 _PART = re.compile(r".+\.[0-9a-f]{16}\.part")
-_TRIAL_BYTES = 1 << 16  # a full disk still makes empty files
+_TRIAL_BYTES = 1 << 16  # on a full disk, empty files can still be made
 _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _APPEND = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-_MODE = 0o666  # less the umask
+_MODE = 0o666  # the umask is applied to it
 _HINTS = {
     errno.ENOSPC: "make room", errno.EDQUOT: "make room", errno.ENOENT: "give a folder that exists",
     errno.ENOTDIR: "give a folder that exists",
@@ -30,17 +30,17 @@ _HINTS = {
 
 @contextmanager
 def whole(file: Path) -> Iterator[BinaryIO]:
-    """A new file, open for bytes, that takes the place of ``file`` at the end; if anything fails, nothing has changed.
+    """A new file, open for writing bytes. It replaces ``file`` at the end. After an error, ``file`` is unchanged.
 
-    Its ``name`` is a path in the same folder, for writers that want one.
+    Its ``name`` is a path in the same folder, for writers that need a path.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the file cannot be written.
     """
     try:
         with _beside(file) as opened:
             yield opened
-            opened.close()  # what fails only now fails before the old file is gone
+            opened.close()  # an error here still leaves the old file
             os.replace(opened.name, file)
     except OSError as bad:
         raise UserError(f"{_cannot_be_written(file, bad)}; what is finished is kept") from None
@@ -48,8 +48,8 @@ def whole(file: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _beside(file: Path) -> Iterator[BinaryIO]:
-    """A new file in the same folder, which goes at the end unless it has got another name."""
-    part = file.with_name(f"{file.name}.{secrets.token_hex(8)}.part")  # which nobody can have put a link at
+    """A new file in the same folder. It is deleted at the end unless it was renamed."""
+    part = file.with_name(f"{file.name}.{secrets.token_hex(8)}.part")  # random, so that no link can have this name
     try:
         with open(part, "w+b", opener=lambda path, _: os.open(path, _NEW, _MODE)) as opened:
             yield opened
@@ -59,7 +59,7 @@ def _beside(file: Path) -> Iterator[BinaryIO]:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write text as UTF-8; what Unicode has no place for becomes a question mark. Raises UserError."""
+    """Write text as UTF-8. Characters that cannot be encoded become question marks. Raises UserError."""
     with whole(file) as opened:
         opened.write(text.encode("utf-8", "replace"))
 
@@ -71,7 +71,7 @@ def save_arrays(file: Path, **arrays: np.ndarray) -> None:
 
 
 def append_to(file: Path) -> BinaryIO:
-    """Open a file to read and to append to; it is made where there is none. Raises UserError, also for a link."""
+    """Open a file for reading and appending; create it if it does not exist. Raises UserError, also for a link."""
     try:
         return open(file, "r+b", opener=lambda path, _: os.open(path, _APPEND, _MODE))
     except OSError as bad:
@@ -79,7 +79,7 @@ def append_to(file: Path) -> BinaryIO:
 
 
 def make_folder(folder: Path, *, parents: bool = False) -> None:
-    """Make a folder where there is none. Raises UserError, also for a link."""
+    """Make a folder if it does not exist. Raises UserError, also for a link."""
     try:
         if folder.is_symlink():
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
@@ -89,13 +89,13 @@ def make_folder(folder: Path, *, parents: bool = False) -> None:
 
 
 def check_writable(*files: Path, option: str = "") -> None:
-    """Try whether files could be written, before the work that they are for.
+    """Check that files can be written, before a long computation.
 
     Args:
-        option: that named them, for the error.
+        option: name of the command line option, for the error.
 
     Raises:
-        UserError: one cannot.
+        UserError: a file cannot be written.
     """
     for file in files:
         try:
@@ -108,14 +108,14 @@ def check_writable(*files: Path, option: str = "") -> None:
 
 
 def prepare_outputs(*files: Path) -> None:
-    """Make the folders of files, and try whether they could be written, before the work. Raises UserError."""
+    """Make the folders of files, and check that the files can be written. Raises UserError."""
     for file in files:
         make_folder(file.parent, parents=True)
     check_writable(*files)
 
 
 def check_folders(folder: Path) -> None:
-    """Raises UserError for a link to a folder anywhere inside: what is written there would leave it."""
+    """Raise UserError if a folder contains a link to a folder: files written there would be outside."""
     for where, names, _ in os.walk(folder):
         for name in names:
             if (path := Path(where) / name).is_symlink():
@@ -123,7 +123,7 @@ def check_folders(folder: Path) -> None:
 
 
 def drop_parts(folder: Path) -> None:
-    """Delete what processes that were killed left of files that they had not finished."""
+    """Delete unfinished files of killed processes."""
     for where, _, names in os.walk(folder):
         for name in filter(_PART.fullmatch, names):
             with suppress(OSError):
@@ -131,7 +131,7 @@ def drop_parts(folder: Path) -> None:
 
 
 def _cannot_be_written(file: Path, bad: OSError, option: str = "") -> str:
-    """What is wrong with a file that cannot be written, and what helps."""
+    """The error text for a file that cannot be written, with the remedy."""
     what = f"{option} {file}" if option else f"{file}"
     if bad.errno == errno.ELOOP:
         return f"{what}: a link; delete it, and the thing itself takes its place"

@@ -1,11 +1,11 @@
-"""Ctrl-C and SIGTERM, so that they stop a run where it can be continued.
+"""Ctrl-C and SIGTERM: they stop a run at points where it can be resumed.
 
-MuJoCo steps in callbacks of compiled programs, and those run on the main thread. An exception raised there would come
-back as an error of XLA, so a signal that arrives in a callback waits for ``raise_if_interrupted``; one that arrives
-while something is being saved waits for that.
+MuJoCo runs in callbacks of compiled programs, on the main thread. An exception in a callback would become an error of
+XLA. Therefore a signal during a callback is pending until ``raise_if_interrupted``, and a signal during a save is
+pending until the save has finished.
 
-Python handles no signal while XLA compiles or runs a long program. Whoever sends SIGTERM kills soon after, so a thread
-watches: what has not stopped in time is saved by that thread, and ended.
+Python does not handle signals while XLA compiles or runs a long program. SIGTERM is usually followed by SIGKILL.
+Therefore a thread watches for SIGTERM. If the program has not stopped in time, the thread saves and ends it.
 """
 
 import os
@@ -18,29 +18,29 @@ from types import FrameType
 
 from ct_jax.terminal import one_line
 
-GRACE_S = 4.0  # after SIGTERM, until the thread saves by itself: SIGKILL often comes after ten
+GRACE_S = 4.0  # time from SIGTERM until the thread saves; SIGKILL often follows after ten seconds
 _CALLBACKS = ("ct_envs.host_call", "jax._src.callback")
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: like Ctrl-C, but what asked for it expects it to be obeyed, not reported."""
+    """SIGTERM. It stops the program like Ctrl-C, but the exit status is 0."""
 
 
 _KINDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
 _waiting: list[type[KeyboardInterrupt]] = []
 _holders: list[object] = []
 _rescues: list[Callable[[], None]] = []
-_largest: Callable[[int], int] | None = None  # of the numbers that several processes name
+_largest: Callable[[int], int] | None = None  # maximum of a number over all processes
 
 
 def obey_together(largest: Callable[[int], int]) -> None:
-    """With several processes a signal to any of them stops all, where all look for one, and only there."""
+    """For several processes: a signal to any process stops all of them, at the next ``raise_if_interrupted``."""
     global _largest
     _largest = largest
 
 
 def raise_if_interrupted() -> None:
-    """Raise what a signal asked for during a callback. Long loops call it between their compiled programs."""
+    """Raise the exception of a pending signal. Long loops call it between compiled programs."""
     kinds = [None, *_KINDS.values()]
     kind = kinds.index(_waiting[0]) if _waiting else 0
     if _largest is not None:
@@ -52,7 +52,7 @@ def raise_if_interrupted() -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """A signal that arrives within is obeyed at the end."""
+    """A context in which signals are pending. They are handled at its end."""
     holder = object()
     _holders.append(holder)
     try:
@@ -65,7 +65,7 @@ def uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def rescued_by(save: Callable[[], None]) -> Iterator[None]:
-    """Within, ``save`` is called, from another thread, if SIGTERM finds the program where it cannot be stopped."""
+    """A context with a ``save`` for SIGTERM. Another thread calls it if the program cannot be stopped in time."""
     _rescues.append(save)
     try:
         yield
@@ -75,12 +75,12 @@ def rescued_by(save: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def interruptible(farewell: str = "stopped") -> Iterator[None]:
-    """SIGINT raises ``KeyboardInterrupt`` and SIGTERM ``Terminated`` within, as soon as that is safe.
+    """A context in which SIGINT raises ``KeyboardInterrupt`` and SIGTERM raises ``Terminated``, as soon as it is safe.
 
     Args:
-        farewell: what is said on stderr where SIGTERM has to end the process without them.
+        farewell: message on stderr if the watching thread ends the process after SIGTERM.
     """
-    if threading.current_thread() is not threading.main_thread():  # only there can signals be handled
+    if threading.current_thread() is not threading.main_thread():  # Python handles signals only on the main thread
         yield
         return
     before = {number: signal.signal(number, _handle) for number in _KINDS}
@@ -104,16 +104,16 @@ def interruptible(farewell: str = "stopped") -> Iterator[None]:
 
 
 def _watch(reader: int, over: threading.Event, farewell: str) -> None:
-    """Wait for SIGTERM, as the system reports it; if the program has not stopped in time, save and end it."""
+    """Wait for SIGTERM. If the program does not stop in time, save and end it."""
     while signals := os.read(reader, 64):
         if signal.SIGTERM in signals and not over.wait(GRACE_S):
             break
-    if over.is_set() or _largest is not None:  # one process can save nothing without the others
+    if over.is_set() or _largest is not None:  # several processes can only save together
         return
     for save in reversed(_rescues):
         try:
             save()
-        except Exception as error:  # what was saved before is still there
+        except Exception as error:  # earlier checkpoints are still there
             print(f"error: {one_line(error)}", file=sys.stderr)
     print(farewell, file=sys.stderr, flush=True)
     os._exit(0)

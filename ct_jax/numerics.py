@@ -1,4 +1,4 @@
-"""The numerics of this package, whoever calls it: the command line, a script, or a program with settings of its own."""
+"""The numerical settings of this package. They are the same for the command line and for any calling program."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ def own_numerics() -> Iterator[None]:
 
 
 def with_own_numerics(function: Callable[P, T]) -> Callable[P, T]:
-    """The function, which now runs, traces and compiles with ``own_numerics``."""
+    """A function that runs, traces and compiles with ``own_numerics``."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:

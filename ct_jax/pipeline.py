@@ -304,9 +304,9 @@ def answer(
 def _asking(model: TrainedModel, method: str, return_scale: float) -> TrainedModel:
     """The model asking for k times the predicted return. Raises UserError for a k that means nothing."""
     if not 0.0 < return_scale <= MAX_RETURN_SCALE:
-        raise UserError(f"--return_scale {return_scale}: give a factor above 0, at most {MAX_RETURN_SCALE:g}")
+        raise UserError(f"--return-scale {return_scale}: give a factor above 0, at most {MAX_RETURN_SCALE:g}")
     if method != "ct" or not model.settings.model.returns:
-        raise UserError("--return_scale is for a transformer that asks for a return (--method ct); leave it out")
+        raise UserError("--return-scale needs a transformer with returns as inputs (--method ct); leave it out")
     return replace(model, policy=model.policy.replace(return_scale=return_scale))
 
 

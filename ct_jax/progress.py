@@ -1,4 +1,4 @@
-"""What a person sees and what is logged while a stage runs: a bar with the time left, metrics.jsonl, TensorBoard."""
+"""Progress of a stage: a bar with the remaining time, metrics.jsonl, and TensorBoard."""
 
 import json
 import math
@@ -21,17 +21,16 @@ from ct_jax.files import append_to, make_folder
 from ct_jax.interrupts import raise_if_interrupted
 from ct_jax.terminal import one_line
 
-PLAIN_EVERY_S = 15.0  # where there is no terminal, a line this often
+PLAIN_EVERY_S = 15.0  # without a terminal, interval of progress lines
 
 
 class Bar:
-    """Progress of one stage on stderr: a live bar on a terminal, a line now and then elsewhere. Of several processes
-    the first one tells."""
+    """Progress of one stage on stderr: a live bar on a terminal, otherwise lines. Only process 0 shows it."""
 
     def __init__(self, name: str, total: int, *, console: Console | None = None):
         """
         Args:
-            console: where to show it; by default stderr.
+            console: output; the default is stderr.
         """
         self.name, self.total = one_line(name), total
         self._begun = self._spoke = time.monotonic()
@@ -58,7 +57,7 @@ class Bar:
             self._say(f"done in {time.monotonic() - self._begun:.0f} s")
 
     def update(self, done: int, note: str = "") -> None:
-        """Show ``done`` of ``total``, and a short note. Raises ``KeyboardInterrupt`` if one is waiting."""
+        """Show ``done`` of ``total``, and a short note. Raises ``KeyboardInterrupt`` if a signal is pending."""
         done = min(done, self.total)
         if self._live:
             self._live.update(self._task, completed=done, note=note)
@@ -70,7 +69,7 @@ class Bar:
         raise_if_interrupted()
 
     def _left(self, done: int) -> str:
-        """The time left, from the speed since the first update: a resumed stage does not begin at zero."""
+        """The remaining time, from the speed since the first update. A resumed stage does not start at zero."""
         if self._first is None or done <= self._first:
             return ""
         left = (time.monotonic() - self._begun_at) * (self.total - done) / (done - self._first)
@@ -78,15 +77,15 @@ class Bar:
 
     def _say(self, text: str) -> None:
         if self._tells:
-            with suppress(OSError):  # a full disk under a log, or nobody there to read: the work goes on
+            with suppress(OSError):  # the work continues if stderr is closed, or is a log on a full disk
                 print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
 
 class Metrics:
     """Scalars of a run, appended to ``metrics.jsonl`` and to TensorBoard's files in ``tensorboard/``.
 
-    Both are written at once: TensorBoard's usual writer has a thread of its own, and hangs when the disk is full. Of
-    several processes the first one writes.
+    Both are written immediately. TensorBoard's usual writer has its own thread, which hangs if the disk is full. Only
+    process 0 writes.
     """
 
     def __init__(self, run: Path):
@@ -97,12 +96,12 @@ class Metrics:
         make_folder(board)
         self._file = append_to(run / "metrics.jsonl")
         _drop_half_line(self._file)
-        # It would follow a link, so its name is one that nobody can know before.
+        # The writer follows links. A random name ensures that no link has this name.
         self._board = EventsWriter(str(board / "events"), f".{secrets.token_hex(8)}")
         self._begun = time.monotonic()
 
     def log(self, stage: str, step: int, **values: float) -> None:
-        """Log the scalars of a stage at a step. What is not finite is null: JSON knows no other way."""
+        """Log the scalars of a stage at a step. Values that are not finite become null: JSON has none."""
         if not self._writes:
             return
         record: dict[str, str | float | None] = {"stage": stage, "step": step}
@@ -126,5 +125,5 @@ class Metrics:
 
 
 def _drop_half_line(file: BinaryIO) -> None:
-    """Cut off the end of a last line that a killed process did not finish."""
+    """Remove an incomplete last line, which a killed process may have left."""
     file.truncate(file.read().rfind(b"\n") + 1)

@@ -1,7 +1,7 @@
-"""A run's folder: what the run is of, what made it, and which of its stages are finished.
+"""The folder of a run: its configuration, its provenance, and its finished stages.
 
-``config.json`` says what the run is of, and a run is only continued as what it was begun. Each stage has a folder of
-its own, and ``done.json`` in it is written last.
+``config.json`` holds the configuration. A run can only be continued with the same configuration. Each stage has its own
+folder. A stage writes ``done.json`` last.
 """
 
 import fcntl
@@ -40,48 +40,48 @@ STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report
 
 @dataclass(frozen=True)
 class Run:
-    """A run: a folder, and what it is of."""
+    """A run: its folder and its configuration."""
 
     folder: Path
     robot: str
     preset: str
     settings: Settings
-    mazes: dict[str, Maze]  # trained in; none for a robot that drives in rooms
-    eval_mazes: dict[str, Maze]  # evaluated in besides them
+    mazes: dict[str, Maze]  # training mazes; empty for a robot in rooms
+    eval_mazes: dict[str, Maze]  # further mazes for the evaluation
     seed: int
     engine: str
 
     def key(self, stage: str) -> jax.Array:
-        """The stage's own randomness."""
+        """The random key of a stage."""
         return jax.random.fold_in(jax.random.key(self.seed), STAGES.index(stage))
 
     def round_keys(self, stage: str, number: int) -> jax.Array:
-        """The keys of a round: to start and train the value network, likewise the transformer, and to recover."""
+        """Five random keys of a round: initialise and train V, initialise and train the transformer, recover."""
         return jax.random.split(jax.random.fold_in(self.key(stage), number), 5)
 
     @property
     def spec(self) -> Robot:
-        """The robot's data."""
+        """The robot."""
         return get_robot(self.robot)
 
     @property
     def stacked(self) -> Maze | None:
-        """The mazes that its data may be in along a leading axis, if any: the named ones, then the generator's."""
+        """All mazes of the run's data, stacked: the named training mazes, then the random ones; None for rooms."""
         settings = self.settings
         return self.stack(max(settings.random_mazes, settings.recover.random_mazes)) if self.mazes else None
 
     def stack(self, besides: int) -> Maze:
-        """The named training mazes, and so many of the generator's."""
+        """The named training mazes and ``besides`` random mazes, stacked."""
         return stack_mazes([*self.mazes.values(), *random_mazes(besides)])
 
     def done(self, stage: str) -> dict[str, Any] | None:
-        """What the finished stage said of itself; None if it has not finished."""
+        """The contents of ``done.json`` of a stage; None if the stage is not finished."""
         file = self.folder / stage / "done.json"
         return devices.first(lambda: read_json(file, hint=self.hint(stage)) if file.is_file() else None)
 
     @property
     def made(self) -> dict[str, Any]:
-        """What made the run, for what is shipped of it."""
+        """The provenance of the run, for the files of a model."""
         file = self.folder / "config.json"
         config, names = read_json(file), ("command", "commit", "created", "hardware", "versions", "seed")
         missing = [name for name in names if name not in config]
@@ -90,12 +90,12 @@ class Run:
         return {name: config[name] for name in names}
 
     def hint(self, stage: str) -> str:
-        """What to do about a damaged file of a stage."""
+        """The remedy for a damaged file of a stage."""
         return f"delete {self.folder / stage} and continue with --resume"
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-        """A stage's folder, and a dict of what it says of itself, written last. ``wall_s`` sums over interruptions."""
+        """A context for a stage: its folder, and a dict for ``done.json``. ``wall_s`` includes interrupted attempts."""
         folder = self.folder / stage
         file, begun = folder / "spent.json", time.perf_counter()
 
@@ -129,7 +129,7 @@ class Run:
 
 @contextmanager
 def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[dict[str, Any]]:
-    """A training's bar, metrics, and checkpoints in the folder: its ``on_progress`` and ``checkpoints``."""
+    """A context with the arguments ``on_progress`` and ``checkpoints`` for a training in a folder."""
     with Bar(name, total) as bar, closing(Checkpoints(folder / f"checkpoints-{name}")) as checkpoints:
 
         def on_progress(done: int, report: float | dict[str, float]) -> None:
@@ -142,7 +142,7 @@ def training(folder: Path, name: str, total: int, metrics: Metrics) -> Iterator[
 
 
 def drop_leftovers(folder: Path) -> None:
-    """Delete what only an interrupted stage needs."""
+    """Delete the files that only an unfinished stage needs."""
     for left in (*folder.glob("checkpoints-*"), *folder.glob("waves*")):
         shutil.rmtree(left, ignore_errors=True)
 
@@ -150,10 +150,10 @@ def drop_leftovers(folder: Path) -> None:
 def kept_row(
     folder: Path, name: str, method: str, head: dict[str, Any], measure: Callable[[], Episodes]
 ) -> dict[str, Any]:
-    """A method's row of the table, with its episodes beside it in the folder; once there, read back.
+    """The row of a method. The first call measures it, and writes the row and its episodes; later calls read it.
 
     Args:
-        head: what the row begins with.
+        head: the first entries of the row.
     """
     file = folder / f"{slug(name)}-{method}.json"
     if not devices.first(file.is_file):
@@ -171,7 +171,7 @@ def kept_row(
 
 
 def is_row(row: Any) -> bool:
-    """Whether a value can stand in a table: what ``Episodes.summary`` makes, and what it is of."""
+    """Whether a value is a valid row: the entries of ``Episodes.summary``, with method and maze."""
 
     def is_number(value: Any) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool)
@@ -187,12 +187,12 @@ def is_row(row: Any) -> bool:
 
 
 def episodes_file(folder: Path, name: str, method: str) -> Path:
-    """Where a row's episodes are."""
+    """The file with the episodes of a row."""
     return folder / f"{slug(name)}-{slug(method)}.npz"
 
 
 def _save_episodes(file: Path, episodes: Episodes) -> None:
-    """Write what happened, for the report's pictures."""
+    """Write episodes for the pictures of the report."""
     arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "fell", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
     more = {name: getattr(episodes, name) for name in ("frontal", "grazing", "diverged")}
@@ -206,10 +206,10 @@ def _save_episodes(file: Path, episodes: Episodes) -> None:
 
 
 def load_mazes(names: tuple[str, ...]) -> dict[str, Maze]:
-    """Mazes by name or file, in order; a file's maze is called like the file, without folder and ending.
+    """Load mazes by name or file, in order. The name of a maze from a file is the file name without folder and suffix.
 
     Raises:
-        UserError: a maze that cannot be read, or two of one name.
+        UserError: a maze cannot be read, or two mazes have the same name.
     """
     mazes: dict[str, Maze] = {}
     for given in names:
@@ -219,12 +219,12 @@ def load_mazes(names: tuple[str, ...]) -> dict[str, Maze]:
 
 
 def random_mazes(n: int) -> list[Maze]:
-    """The first n training mazes of the generator, the same for all runs; about the size of the paper's."""
+    """The first n random training mazes, the same for all runs. They have about the size of the paper's mazes."""
     return [make_maze(random_walls(seed, height=9, width=13, density=0.9)) for seed in range(n)]
 
 
 def join_mazes(seen: dict[str, Maze], unseen: dict[str, Maze]) -> dict[str, Maze]:
-    """Seen and unseen mazes together. Raises UserError if two of them have one name."""
+    """Seen and unseen mazes together. Raises UserError if two different mazes have the same name."""
     together = dict(seen)
     for name, maze in unseen.items():
         _add(together, name, maze, name)
@@ -239,13 +239,16 @@ def _add(mazes: dict[str, Maze], name: str, maze: Maze, given: str) -> None:
 
 
 def maze_text(maze: Maze) -> str:
-    """The maze as its file would show it."""
+    """The maze as text, in the format of a maze file."""
     return draw_walls(unpadded(maze))
 
 
 def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The paper's training and evaluation mazes for a robot, if it is one for mazes. Raises UserError for an unknown
-    one."""
+    """The paper's training and evaluation mazes for a robot; none for a robot in rooms.
+
+    Raises:
+        UserError: the robot is unknown.
+    """
     if get_robot(robot).course != "maze":
         return (), ()
     return ("antmaze-large",), ("antmaze-large-eval", "hall") if robot == "humanoid" else ("antmaze-large-eval",)
@@ -261,10 +264,11 @@ def slug(name: str) -> str:
 
 @contextmanager
 def open_run(run: Run, *, resume: bool) -> Iterator[None]:
-    """Make the run's folder, or check that the one there is the same run; no other process may work in it meanwhile.
+    """A context that makes and locks the run's folder. An existing folder must belong to the same run.
 
     Raises:
-        UserError: the folder cannot be made, is in use and ``resume`` is not given, or is another run's.
+        UserError: the folder cannot be made, has a run although ``resume`` is False, has another run, or is in use by
+            another process.
     """
     join_mazes(run.mazes, run.eval_mazes)
     with ExitStack() as held:
@@ -277,7 +281,7 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
             config = run.folder / "config.json"
             if not config.is_file():
                 write_json(config, identity(run) | provenance())
-            for stage in STAGES:  # a process may have been killed between a stage's end and its tidying up
+            for stage in STAGES:  # a process may have been killed between the end of a stage and its cleanup
                 if (run.folder / stage / "done.json").is_file():
                     drop_leftovers(run.folder / stage)
 
@@ -298,14 +302,14 @@ def _make_folder(run: Run, resume: bool) -> None:
         run.folder.mkdir(parents=True, exist_ok=True)
     except OSError as bad:
         raise UserError(f"{run.folder}: cannot be made ({bad.strerror}); choose another place with --out") from None
-    # What a process left that was killed before it wrote config.json does not count.
+    # Ignore files of a process that was killed before it wrote config.json.
     if not config.is_file() and any(path.suffix not in (".lock", ".part") for path in run.folder.iterdir()):
         raise UserError(f"{run.folder}: not empty and no run folder; choose another with --out")
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Holds the folder; the system lets go of it when the process ends, however it ends."""
+    """A context that locks the folder. The system releases the lock when the process ends, even if it is killed."""
     with append_to(folder / "run.lock") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -315,8 +319,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def identity(run: Run) -> dict[str, Any]:
-    """What a run is of: a run is only continued by one that agrees in all of it."""
-    settings = json.loads(json.dumps(to_dict(run.settings)))  # tuples as lists, as they are read back
+    """The configuration of a run. A run can only be continued with the same configuration."""
+    settings = json.loads(json.dumps(to_dict(run.settings)))  # tuples become lists, as when the file is read
     texts = [{name: maze_text(maze) for name, maze in mazes.items()} for mazes in (run.mazes, run.eval_mazes)]
     return {
         "robot": run.robot,
@@ -339,7 +343,7 @@ def _check_same(run: Run, config: Path) -> None:
 
 
 def _settings_of(config: Path, values: Any) -> dict[str, Any]:
-    """The settings that an earlier version may have written, as this one writes them."""
+    """The settings in a file, which an earlier version may have written, in the current format."""
     try:
         return json.loads(json.dumps(to_dict(from_dict(values))))
     except UserError as bad:
@@ -347,7 +351,7 @@ def _settings_of(config: Path, values: Any) -> dict[str, Any]:
 
 
 def _difference(name: str, before: Any, now: Any) -> str:
-    """The first thing in which two values differ, in words; empty if they do not."""
+    """A description of the first difference between two values; empty if they are equal."""
     if before == now:
         return ""
     if isinstance(before, dict) and isinstance(now, dict):
@@ -364,7 +368,7 @@ def _difference(name: str, before: Any, now: Any) -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """Command, commit, date, hardware and versions: what is needed to make a result again."""
+    """Command, commit, date, hardware and versions: what is needed to reproduce a result."""
     packages = ("jax", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy", "networkx")
     versions = {"ct-jax": __version__, "python": platform.python_version()}
     return {
@@ -380,15 +384,15 @@ def _command() -> str:
     program = Path(sys.argv[0]).resolve()
     if program.name in ("ct-jax", "cli.py"):
         return shlex.join(["ct-jax", *sys.argv[1:]])
-    # From the repository's root, and without what the machine's folders are called.
+    # Give the path relative to the repository's root, without the folders of this machine.
     inside = program.is_relative_to(Path.cwd())
     return shlex.join(["python", str(program.relative_to(Path.cwd())) if inside else program.name, *sys.argv[1:]])
 
 
 def _commit() -> str:
-    """The commit of this code, if it is the code of a repository and not only installed inside one.
+    """The commit of this code; "unknown" if its files are not tracked by git.
 
-    "-dirty" if tracked files are changed, but for those in which experiments write down what they found.
+    It ends with "-dirty" if tracked files are changed. Results of experiments and docs are ignored.
     """
     git, here = shutil.which("git"), Path(__file__)
 
@@ -405,7 +409,7 @@ def _commit() -> str:
 
 
 def hardware() -> str:
-    """The devices in words."""
+    """A description of the devices."""
     found = jax.devices()
     accelerators = "" if found[0].platform == "cpu" else f"{len(found)} x {found[0].device_kind}, "
     hosts = f"{jax.process_count()} processes, each " if jax.process_count() > 1 else ""

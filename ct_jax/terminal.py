@@ -1,4 +1,4 @@
-"""What reaches the terminal: names that others chose cannot command it, and what it cannot show does no harm."""
+"""Output to the terminal: without control characters, and with replacements for characters that it cannot show."""
 
 import codecs
 import io
@@ -16,21 +16,21 @@ _ALWAYS_FULL = os.makedev(1, 7)  # /dev/full
 
 
 def printable(text: Any) -> str:
-    """The text with all that is neither visible nor a space, escape sequences among them, as Python would write it."""
+    """The text with Python escapes for characters that are neither visible nor a space, such as control codes."""
     return "".join(c if c.isprintable() or category(c) == "Zs" else ascii(c)[1:-1] for c in str(text))
 
 
 def one_line(text: Any) -> str:
-    """The same, with single spaces for all white space."""
+    """Like ``printable``, in one line: all white space becomes single spaces."""
     return printable(" ".join(str(text).split()))
 
 
 def show_anything() -> None:
-    """From now on, what stdout or stderr has no letters for is shown by what looks like it, or as Python's escapes."""
+    """From now on, characters that stdout or stderr cannot encode are replaced by similar ones or by Python escapes."""
     for number in range(3):
         try:
             os.fstat(number)
-        except OSError:  # closed: what is opened next would take its place, and get what is printed
+        except OSError:  # closed: the next opened file would get this number, and the printed text
             os.open(os.devnull, os.O_RDWR)
     sys.stdout = sys.stdout or io.TextIOWrapper(io.FileIO(1, "w", closefd=False))
     sys.stderr = sys.stderr or io.TextIOWrapper(io.FileIO(2, "w", closefd=False))
@@ -47,7 +47,7 @@ def _alike(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def check_stdout() -> None:
-    """Try whether something could be written to stdout, before the work that it is for. Raises UserError."""
+    """Check that stdout can be written, before a long computation. Raises UserError."""
     found = os.fstat(1)
     full = stat.S_ISCHR(found.st_mode) and found.st_rdev == _ALWAYS_FULL
     if stat.S_ISREG(found.st_mode):

@@ -45,9 +45,7 @@ class Frame(NamedTuple):
     """N episodes at one control step."""
 
     obs: Observation
-    reward: Float[
-        AnyArray, "N"
-    ]  # since the last action, as the robot can tell: minus the distance to the goal [m]
+    reward: Float[AnyArray, "N"]  # since the last action, as the robot can tell: minus the distance to the goal [m]
     done: Bool[AnyArray, "N"]
     privileged: Privileged
 

@@ -2,10 +2,10 @@
 
     python experiments/ant.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--controller own|zoo]
 
-With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. Planner and explorer
-are the references. All methods have the same 100 start-goal pairs. Training your own low-level controller
-takes longest on two cores; ``--controller zoo`` uses the shipped one. ``zoo:ant`` is ``calm-ct``. Writes
+``--preset cpu`` trains small models of all methods in the paper's table II on 1000 guided trajectories: published CT,
+BC-CT, F-CT, PT-CQL and SAC alone. It also trains the lifted method without and with fine-tuning. Planner and explorer
+are the references. All methods have the same 100 start-goal pairs. Training a low-level controller takes the longest
+time on two cores; ``--controller zoo`` uses the shipped controller. ``zoo:ant`` is ``calm-ct``. Writes
 ``experiments/results/ant-PRESET.json``.
 """
 
@@ -13,8 +13,8 @@ from overrides import BC, CALM, CT, LONG, LONG_CT, MAZES, MAZES_CT, MODES, MODES
 from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 40, "round_fit": half_the_updates}
-MEMORY = {"model.stride": 3}  # the same number of steps in memory, farther apart
-# The action head is the fixed low-level controller. It has one gait, so data are only rotated, not reflected.
+MEMORY = {"model.stride": 3}  # the memory holds every third step
+# The action head is the fixed low-level controller. It has one gait, so data are rotated but not reflected.
 SKILL = {"model.skill": True, "fit.turns": True, "round_fit.turns": True, "last_fit.turns": True}
 
 SHIPPED = "calm-ct"  # the variant of zoo:ant

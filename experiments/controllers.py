@@ -1,9 +1,9 @@
-"""Ships low-level controllers with the package: copies the controllers of finished runs into it.
+"""Copy the low-level controllers of finished runs into the package, so that they ship with it.
 
     python experiments/controllers.py --ship runs/ant/cpu-ct-0
 
-``--controller zoo`` uses a shipped controller. It consists of the weights and ``controller.json``: its settings; the
-command, commit and machine that made it; its success on held-out edges during its training; and the training time.
+``--controller zoo`` uses a shipped controller. It consists of the weights and ``controller.json``, which contains the
+settings, command, commit and machine of its training, the training time, and the success on held-out edges over time.
 ``experiments/pages.py`` writes ``docs/results/controllers.md`` from these files.
 """
 

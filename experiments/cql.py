@@ -1,10 +1,10 @@
-"""Chooses PT-CQL's settings, as fairly as for the other methods: in the training maze, on pairs that no table uses.
+"""Choose the settings of PT-CQL in the training maze, on pairs that no table uses.
 
     python experiments/cql.py --robot ant [--alpha 0.05 0.2 1 5] [--target-rate 0.005 0.05] [--controller zoo]
 
-Each choice is trained on the planning trajectories of the method as published, and evaluated in the training maze on
-100 pairs of seed 7 (the tables use seed 0). Writes ``experiments/results/cql.json``; ``study.pt_cql_config`` holds the
-choice.
+Each choice is trained on the planning trajectories of the method as published, and evaluated in the training
+maze on 100 pairs of seed 7 (the tables use seed 0). Writes ``experiments/results/cql.json``. ``study.pt_cql_config``
+contains the settings that were chosen.
 """
 
 import itertools
@@ -33,11 +33,11 @@ class Options:
     alpha: tuple[float, ...] = (0.05, 0.2, 1.0, 5.0)
     """Weights of the conservative penalty."""
     target_rate: tuple[float, ...] = (0.005, 0.05)
-    """Shares of the new critics in the target critics at each update."""
+    """Rates at which the target critics follow the critics at each update."""
     reward_scale: tuple[float, ...] = (0.1,)
     """Factors of the reward in the critics' targets."""
     imitation: tuple[int, ...] = (0,)
-    """Numbers of first updates in which the policy imitates the data."""
+    """Numbers of initial updates in which the policy imitates the data."""
     updates: int = 2500
     """Updates of each training."""
     controller: str = "zoo"
@@ -45,11 +45,11 @@ class Options:
     seed: int = 0
     """Seed of the data and of the training."""
     out: Path = Path("runs/cql")
-    """Folder for the models; finished ones are not trained again."""
+    """Folder for the models. Finished models are not trained again."""
 
 
 def main(options: Options) -> None:
-    """Try all choices; write each result as soon as it is measured."""
+    """Try all choices of settings. Write each result as soon as it is measured."""
     prepare_outputs(FILE)
     prepare_jax()
     variants = load_variants(options.robot)

@@ -1,4 +1,4 @@
-"""Measures the gain from fine-tuning, F-CT − CT in unseen mazes, pair by pair, on more pairs than the tables have.
+"""Measure the gain from fine-tuning (F-CT − CT) in unseen mazes, on more start-goal pairs than the tables have.
 
     python experiments/finetuned.py --robot ant [--seeds 0 1 2] [--tuned modes] [--runs runs/ant] [--maze validation-2]
 
@@ -39,7 +39,7 @@ class Options:
     tuned: str = "cpu"
     """The fine-tuned variant; it is compared with the variant before fine-tuning."""
     longer: bool = False
-    """Compare with long-ct instead, which has about the same number of updates as F-CT."""
+    """Compare with long-ct instead. It has about the same total number of updates as F-CT."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the models."""
     runs: Path | None = None
@@ -71,12 +71,12 @@ def before_of(options: Options) -> str:
     """The variant to compare with. Raises UserError if ``--tuned`` does not name a fine-tuned variant."""
     tuned = {name: variant.tuned_from for name, variant in load_variants(options.robot).items() if variant.tuned_from}
     if options.tuned not in tuned:
-        raise UserError(f"--tuned {options.tuned}: no fine-tuned variant; give one of {', '.join(tuned)}")
+        raise UserError(f"--tuned {options.tuned}: not a fine-tuned variant; give one of {', '.join(tuned)}")
     return LONGER if options.longer else tuned[options.tuned]
 
 
 def main(options: Options) -> None:
-    """Measure all seeds and mazes; write each pair of rows as soon as it is measured."""
+    """Measure all seeds and mazes. Write each pair of rows as soon as it is measured."""
     prepare_outputs(FILE)
     prepare_jax()
     variants = (before_of(options), options.tuned)

@@ -3,18 +3,18 @@
 
     python experiments/humanoid.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--controller own|zoo]
 
-With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without and with fine-tuning. Planner and explorer
-are the references. All methods have the same 100 start-goal pairs. Training your own low-level controller
-takes hours on one core and can be interrupted at any time; ``--controller zoo`` uses the shipped one.
-``zoo:humanoid`` is ``cpu``. Writes ``experiments/results/humanoid-PRESET.json``.
+``--preset cpu`` trains small models of all methods in the paper's table II on 1000 guided trajectories: published CT,
+BC-CT, F-CT, PT-CQL and SAC alone. It also trains the lifted method without and with fine-tuning. Planner and explorer
+are the references. All methods have the same 100 start-goal pairs. Training a low-level controller takes hours on one
+core, and can be interrupted at any time; ``--controller zoo`` uses the shipped controller. ``zoo:humanoid`` is ``cpu``.
+Writes ``experiments/results/humanoid-PRESET.json``.
 """
 
 from overrides import BC, CALM, CT, LONG, LONG_CT, MAZES, MAZES_CT, MODES, MODES_CT, ROAM
 from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 60, "round_fit": half_the_updates}
-MEMORY = {"model.stride": 4}  # the same number of steps in memory, farther apart
+MEMORY = {"model.stride": 4}  # the memory holds every fourth step
 
 SHIPPED = "cpu"  # the variant of zoo:humanoid
 

@@ -8,22 +8,22 @@ from rows import Row, Scored
 from ct_jax.evaluate import wilson_of
 
 INTERVALS = (
-    "Intervals are 95 %: Wilson's for one model; for several models a bootstrap over models and pairs, where that is "
-    "wider."
+    "Intervals are 95 % Wilson intervals. For several models, an interval also covers the 95 % interval of a bootstrap "
+    "over models and pairs."
 )
 
 
 def pooled(rows: Sequence[Scored], name: str) -> str:
-    """A rate of all models together, in percent with its interval."""
+    """A rate over all models, in percent with its interval."""
     rate, low, high = rate_of(rows, name)
     return f"{rate:.1f} ({low:.0f} to {high:.0f})"
 
 
 def rate_of(rows: Sequence[Scored], name: str) -> tuple[float, float, float]:
-    """A rate of all models together and the ends of its interval [%].
+    """A rate over all models and the ends of its interval [%].
 
-    Several models are evaluated on the same pairs, so their episodes are not independent. Their interval is the wider
-    of two: Wilson's, and a bootstrap over models and pairs.
+    Several models are evaluated on the same pairs, so their episodes are not independent. Each end of their interval
+    is the outer one of two intervals: Wilson's, and a bootstrap over models and pairs.
     """
     n = sum(row.episodes for row in rows)
     low, high = wilson_of(sum(round(row.rate(name) * row.episodes) for row in rows), n)
@@ -54,7 +54,7 @@ def of_one_model(before: Iterable[Row], after: Iterable[Row]) -> list[Pair]:
 
 
 def gain_of(models: Sequence[Pair]) -> str:
-    """F-CT − CT of several models, pair by pair, in percentage points with its interval."""
+    """F-CT − CT in percentage points with its interval, computed for each pair and each model."""
     changes = [after.flags("success") - before.flags("success") for before, after in models]
     low, high = interval_of_mean(np.stack(changes))
     return f"{100 * np.mean(changes):+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"

@@ -1,9 +1,9 @@
-"""Makes the moving picture of README.md: one episode of a trained model, filmed, beside the map of its maze.
+"""Make the animation in README.md: a film of one episode beside the map of its maze.
 
     python experiments/movie.py --run zoo:ant --maze antmaze-large-eval --seed 2 --out docs/ant.gif
 
-The map is for the reader: the model sees 25 x 25 cells around itself, and the vector to its goal. Needs the package
-``av`` and OpenGL without a display, as ``ct-jax evaluate --video`` does.
+The map is for the reader: the model observes 25 x 25 cells around the robot, and the vector to its goal. Needs the
+package ``av`` and OpenGL without a display, as ``ct-jax evaluate --video`` does.
 """
 
 import tempfile
@@ -59,7 +59,7 @@ def frames_of(video: Path, n: int) -> Iterator[Image.Image]:
 
 
 def draw_map(maze: Maze, path: np.ndarray, goal: np.ndarray, height: int) -> Image.Image:
-    """The maze from above with the path so far: positions [n, 2] and goal [2] (m), x to the right and y up."""
+    """The maze from above with the path so far: positions [n, 2] and goal [2] in metres, x to the right and y up."""
     walls = unpadded(maze)
     scale = height / (walls.shape[0] * float(maze.cell_m))
     side = scale * float(maze.cell_m)

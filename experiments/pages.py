@@ -1,10 +1,10 @@
-"""Writes the results pages: all of docs/results, and the tables in README.md, docs/speed.md and docs/models.
+"""Write the results pages: all of docs/results, and the tables in README.md, docs/speed.md and docs/models.
 
     python experiments/pages.py
 
 Every number comes from ``experiments/results``, ``benchmarks/results`` or ``ct_jax/zoo``; none is typed by hand. In
-README.md, docs/speed.md and docs/models a table stands between ``<!-- NAME -->`` and ``<!-- /NAME -->``. The plots in
-docs/results are drawn anew, too.
+README.md, docs/speed.md and docs/models each table is between ``<!-- NAME -->`` and ``<!-- /NAME -->``. The plots in
+docs/results are drawn again, too.
 """
 
 import json
@@ -42,52 +42,52 @@ BENCHMARKS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs"
 PAGES = DOCS / "results"
 WRITTEN = "<!-- Written by `python experiments/pages.py`. Do not edit. -->"
 HOW = "How each row was made"
-SWEPT = {"density": "density of obstacles / the published one", "noise": "level of noise"}  # with the axis' label
+SWEPT = {"density": "density of obstacles / the published one", "noise": "level of noise"}  # axes and their labels
 
 
 def page(title: str, *parts: str | Sequence[str]) -> str:
-    """A fully generated page, from its paragraphs and tables; empty ones are left out."""
+    """A generated page from its paragraphs and tables. Empty parts are left out."""
     texts = [part.strip() if isinstance(part, str) else "\n".join(part) for part in parts]
     return "\n\n".join([f"# {title}", WRITTEN, *filter(None, texts)]) + "\n"
 
 
 INDEX = """
-Success of every method on fixed start-goal pairs, with intervals. `python experiments/pages.py` writes these pages
-from the files in `experiments/results`. Each page ends with the command, commit, seeds, machine and date that made
-each of its rows. [Reproducing](../reproducing.md) says how to make them again.
+Success rates of all methods on fixed start-goal pairs, with intervals. `python experiments/pages.py` writes these pages
+from the files in `experiments/results`. Each page ends with the command, commit, seeds, machine and date of each row.
+[Reproducing](../reproducing.md) describes how to repeat the measurements.
 
-| page | what |
+| page | content |
 |---|---|
 | [Point](point.md), [ant](ant.md), [humanoid](humanoid.md) | all methods in the seen and the unseen mazes |
 | [Turtlebot3](turtlebot3.md) | all methods in random rooms; other densities, noise, seven pairs |
 | [Fine-tuning](fine-tuning.md) | F-CT − CT on more pairs and in more mazes |
-| [Transfer](transfer.md) | what a trained trunk is worth to another robot |
-| [PT-CQL's settings](pt-cql.md) | how they were chosen |
+| [Transfer](transfer.md) | training that starts from the trunk of another robot's model |
+| [PT-CQL's settings](pt-cql.md) | how the settings were chosen |
 | [Low-level controllers](controllers.md) | the controllers that ship with the package |
 | [Speed](../speed.md) | the benchmarks |
 """
 
 CACHED = """
-Rows as published (*CT*, *BC-CT*, *F-CT*; `ct`, `bc-ct`, `f-ct` of the Turtlebot3) were measured with a key/value cache,
-whose memory reaches `layers x (K - 1) + 1` steps. [Method](../method.md#acting) says why that matters.
+The rows as published (*CT*, *BC-CT*, *F-CT*; `ct`, `bc-ct`, `f-ct` of the Turtlebot3) were measured with a key/value
+cache. Its memory reaches back `layers x (K - 1) + 1` steps. [Method](../method.md#acting) explains the difference from
+the paper.
 """
 
 COLUMNS = """
-| column | what it means |
+| column | meaning |
 |---|---|
-| success % | episodes that reached the goal; of several trained models together |
-| each model | success of each trained model, by seed |
-| SPL | success weighted by path length: 1 is the shortest way in every episode |
+| success % | share of episodes that reached the goal, over all trained models |
+| each model | success rate of each trained model, in the order of the seeds |
+| SPL | success weighted by path length: 1 means the shortest path in every episode |
 | return / 100 | minus the distance to the goal, summed over all steps, divided by 100 |
-| collided % | episodes that touched something at least once |
-| frontal %, grazing % | Turtlebot3: ran into something ahead; touched something with its side |
-| fell % | episodes that ended with the robot on its side or back |
-| full, partial, failed | seven pairs: arrived and touched nothing; arrived and grazed something; the rest |
+| collided % | share of episodes in which the robot touched something |
+| frontal %, grazing % | Turtlebot3: share of episodes with a contact at the front; with a contact at the side |
+| fell % | share of episodes that ended with a fall |
+| full, partial, failed | seven pairs: goal reached without contact; goal reached with grazing contacts; all others |
 
-*planner* knows the whole map. *explorer* draws a map from the local maps that the transformer also sees, and replans:
-it is the alternative to a learned policy. Both lead the same low-level controller. "0.3 m margin" is what their
-roadmap keeps off walls beyond the robot's radius; "action scale 0.75" is the share of the actuators' range that the
-controller uses.
+*planner* knows the whole map. *explorer* builds a map from the local maps that the transformer also sees, and replans.
+Both guide the same low-level controller. "0.3 m margin" is the clearance of their roadmap beyond the robot's radius.
+"action scale 0.75" is the share of the actuators' range that the controller uses.
 """
 
 
@@ -98,20 +98,20 @@ def index_page(results: Mapping[str, Results]) -> str:
 
 
 MAZES = """
-*CT*, *BC-CT*, *F-CT*, *PT-CQL* and *SAC alone* are the methods of the paper. Names in `code` are lifted variants: the
-model has the same size and meets the same pairs. `experiments/{robot}.py` holds what each variant changes;
-[robots](../robots.md#{robot}) discusses the results; [the columns](index.md#columns) are explained on the first page.
+*CT*, *BC-CT*, *F-CT*, *PT-CQL* and *SAC alone* are the methods of the paper. Names in `code` are lifted variants with
+the same model size and the same start-goal pairs. `experiments/{robot}.py` lists what each variant changes.
+[Robots](../robots.md#{robot}) discusses the results. [Results](index.md#columns) explains the columns.
 """
 
 ROOMS = """
-*ct*, *bc-ct* and *f-ct* are the methods as published; the others are lifted. `experiments/turtlebot3.py` holds what
-each variant changes; [robots](../robots.md#turtlebot3) discusses the results; [the columns](index.md#columns) are
-explained on the first page.
+*ct*, *bc-ct* and *f-ct* are the methods as published. The others are lifted variants. `experiments/turtlebot3.py`
+lists what each variant changes. [Robots](../robots.md#turtlebot3) discusses the results.
+[Results](index.md#columns) explains the columns.
 """
 
 
 def maze_page(robot: str, results: Mapping[str, Results]) -> str:
-    """A maze robot's page, with every preset that was measured."""
+    """The page of a robot in mazes, with all measured presets."""
     variants, parts = load_variants(robot), []
     for name, found in results.items():
         of, _, preset = name.rpartition("-")
@@ -119,12 +119,13 @@ def maze_page(robot: str, results: Mapping[str, Results]) -> str:
             continue
         parts += [f"## Preset {preset}", maze_tables(found, variants)]
         if gains := differences(found, variants):
-            parts += [f"### What fine-tuning adds ({preset})", "Pair by pair, of the same models:", gains]
+            about = "Differences are computed for each start-goal pair and each model:"
+            parts += [f"### Gain from fine-tuning ({preset})", about, gains]
         if missing := reasons(found.unmade, variants):
-            parts += [f"### Rows that there are not ({preset})", missing]
+            parts += [f"### Missing rows ({preset})", missing]
         parts += [f"### {HOW} ({preset})", runs_table(found.rows, variants)]
         if (PAGES / f"{name}.png").is_file():
-            parts += [f"### A run's report ({preset})", f"![The report of a run of preset {preset}]({name}.png)"]
+            parts += [f"### Report of a run ({preset})", f"![The report of a run of preset {preset}]({name}.png)"]
     return page(f"Results: {robot}", MAZES.format(robot=robot), *parts)
 
 
@@ -135,15 +136,15 @@ def room_page(results: Results) -> str:
     made = runs_table(every, load_variants("turtlebot3"))
     report = "![The report of the run `cpu`](turtlebot3-cpu.png)"
     return page(
-        "Results: Turtlebot3", ROOMS, room_tables(results), "## Plots", *plots, f"## {HOW}", made, "## A run's report",
+        "Results: Turtlebot3", ROOMS, room_tables(results), "## Plots", *plots, f"## {HOW}", made, "## Report of a run",
         report,
     )  # fmt: skip
 
 
 FINETUNED = """
-More pairs than the robots' tables have, of another seed, in unseen mazes. `validation-1` to `validation-3` are mazes
-for choosing settings. A model is compared with CT of the same seed and the same low-level controller, on the same
-pairs. `long-ct` is CT with about as many updates as F-CT has in all.
+These rows have more start-goal pairs than the robots' pages, of a different seed, in unseen mazes. `validation-1` to
+`validation-3` are mazes for choosing settings. F-CT is compared with CT of the same seed and the same low-level
+controller, on the same pairs. `long-ct` is CT with about the same total number of updates as F-CT.
 """
 
 
@@ -155,14 +156,14 @@ def finetuned_page(rows: Sequence[Row]) -> str:
         return row.robot, f"`{row.variant}`", str(row.model_seed), f"{trained['commit']}, {trained['hardware']}"
 
     note = f"Pairs of seed {rows[0].seed}. {INTERVALS}"
-    made = made_by(rows, ("robot", "variant", "seed", "model made by"), model)
-    return page("What fine-tuning adds", FINETUNED, finetuned_table(rows, load_variants), note, f"## {HOW}", made)
+    made = made_by(rows, ("robot", "variant", "seed", "origin of the model"), model)
+    return page("Gain from fine-tuning", FINETUNED, finetuned_table(rows, load_variants), note, f"## {HOW}", made)
 
 
 TRANSFER = """
-A new transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
-robot's model (paper, sec. IV-A). The last column says after how many updates it reached 90 % of the final success,
-which is the better start's after the last update.
+A new transformer is trained on the planning trajectories of a robot's run, either from scratch or from the trunk of the
+other robot's model (paper, sec. IV-A). The last column is the number of updates after which it reached 90 % of the
+final success rate. The final success rate is that of the better start after the last update.
 """
 
 
@@ -171,8 +172,8 @@ def transfer_page(rows: Sequence[TransferRow]) -> str:
     picture = (
         "![Success in the unseen maze against updates, from scratch and from the other robot's trunk](transfer.png)"
     )
-    note = f"Success in % after so many updates: {rows[0].episodes} pairs in the unseen maze, mean of the seeds. The "
-    note += "picture shows means and ranges of the seeds."
+    note = f"Success in % by number of updates: {rows[0].episodes} pairs in the unseen maze, mean over the seeds. The "
+    note += "plot shows the means and the ranges over the seeds."
     curve = lambda row: (row.robot, f"`{row.run}`", start_of(row), str(row.seed))  # noqa: E731
     made = made_by(rows, ("robot", "run", "start", "seed"), curve)
     return page("Transfer to another robot", TRANSFER, transfer_table(rows), note, picture, f"## {HOW}", made)
@@ -180,16 +181,15 @@ def transfer_page(rows: Sequence[TransferRow]) -> str:
 
 def cql_page(rows: Sequence[CqlRow]) -> str:
     """How PT-CQL's settings were chosen."""
-    about = "PT-CQL's settings were chosen in the training maze, on pairs that no other table uses."
+    about = "The settings of PT-CQL were chosen in the training maze, on pairs that no other table uses."
     note = f"{rows[0].episodes} pairs of seed {rows[0].seed} in {rows[0].maze}. {INTERVALS}"
     made = made_by(rows, ("robot", "model seed"), lambda row: (row.robot, str(row.model_seed)))
     return page("PT-CQL's settings", about, cql_table(rows), note, f"## {HOW}", made)
 
 
 CONTROLLERS = """
-The low-level controllers that ship with the package (`--controller zoo`). *Held-out edges* are roadmap edges that no
-training saw. *Twenty in a row* is the share of twenty edges, one after the other without a reset, that were all
-walked.
+The low-level controllers that ship with the package (`--controller zoo`). *Held-out edges* are roadmap edges that are
+not used in training. *Twenty in a row* is the success rate on sequences of twenty edges without a reset in between.
 """
 
 
@@ -209,7 +209,7 @@ def load_results() -> dict[str, Results]:
 
 
 def load_controllers() -> list[dict[str, Any]]:
-    """The descriptions (``controller.json``) of the shipped controllers."""
+    """The files ``controller.json`` of the shipped controllers."""
     return [json.loads(file.read_text("utf-8")) for file in sorted(ZOO.glob("controllers/*/controller.json"))]
 
 
@@ -234,7 +234,7 @@ def pages() -> dict[Path, str]:
 
 
 def filled(file: Path, tables: Mapping[str, Sequence[str]]) -> dict[Path, str]:
-    """A hand-written page, with new tables between its markers."""
+    """A page written by hand, with new tables between its markers."""
     text = file.read_text("utf-8")
     for name, lines in tables.items():
         text = put(text, name, lines)

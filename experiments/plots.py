@@ -12,7 +12,7 @@ from rows import CT, Row, TransferRow
 
 from ct_jax.files import whole
 
-HELD_OUT_ENOUGH = 0.97  # success on held-out edges that counts as good
+HELD_OUT_ENOUGH = 0.97  # a good success rate on held-out edges
 
 
 def line_of(row: Row) -> str:
@@ -33,7 +33,7 @@ def minutes(controller: Mapping[str, Any]) -> list[tuple[float, float]]:
 
 
 def draw_sweep(rows: Sequence[Row], axis: str, label: str, file: Path) -> None:
-    """Success against ``axis``, a line for each variant and reference, with the intervals of all its models."""
+    """Success against ``axis``: one line for each variant and reference, with intervals over all models."""
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     ax = figure.add_subplot()
     lines: dict[str, dict[float, list[Row]]] = {}

@@ -2,17 +2,17 @@
 
     python experiments/point.py [--preset cpu|demo|paper] [--seeds 0 1 2] [--variants published cpu]
 
-With ``--preset cpu`` every row of the paper's table II is trained at a CPU's size on 1000 guided trajectories: CT as
-published, BC-CT, F-CT, PT-CQL and SAC alone, and the lifted method without (``cpu-ct``) and with fine-tuning
-(``cpu``). Planner and explorer are the references. All methods have the same 100 start-goal pairs. ``zoo:point``
-is ``mazes-ct``. Writes ``experiments/results/point-PRESET.json``.
+``--preset cpu`` trains small models of all methods in the paper's table II on 1000 guided trajectories: published CT,
+BC-CT, F-CT, PT-CQL and SAC alone. It also trains the lifted method without (``cpu-ct``) and with fine-tuning (``cpu``).
+Planner and explorer are the references. All methods have the same 100 start-goal pairs. ``zoo:point`` is ``mazes-ct``.
+Writes ``experiments/results/point-PRESET.json``.
 """
 
 from overrides import BC, CALM, CT, LONG, LONG_CT, MAZES, MAZES_CT, MODES, MODES_CT, ROAM
 from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
 
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 20, "round_fit": half_the_updates}
-MEMORY = {"model.stride": 3}  # the same number of steps in memory, farther apart
+MEMORY = {"model.stride": 3}  # the memory holds every third step
 SKILL = {"model.skill": True}  # the action head is the fixed low-level controller
 
 SHIPPED = "mazes-ct"  # the variant of zoo:point

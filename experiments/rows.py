@@ -1,4 +1,4 @@
-"""The results of the experiments: typed rows, and the files in ``experiments/results`` that hold them."""
+"""The results of the experiments: typed rows, and the files in ``experiments/results``."""
 
 import sys
 from collections.abc import Iterable, Mapping
@@ -25,7 +25,7 @@ class Origin:
     commit: str
     hardware: str
     created: str  # ISO date and time
-    more: Mapping[str, Any] = field(default_factory=dict, repr=False)  # keys of the file that no table reads
+    more: Mapping[str, Any] = field(default_factory=dict, repr=False)  # other keys of the file; no table uses them
 
     @classmethod
     def read(cls, values: Mapping[str, Any]) -> Self:
@@ -81,7 +81,7 @@ class Scored(Origin):
 
 @dataclass(frozen=True, kw_only=True)
 class Made(Origin):
-    """A trained model and one method of it."""
+    """A trained model and a method."""
 
     variant: str
     model_seed: int
@@ -95,23 +95,23 @@ class Made(Origin):
 
 @dataclass(frozen=True, kw_only=True)
 class Row(Made, Scored):
-    """One method of one model, in one maze or in the rooms of one density and noise."""
+    """One method of one model, in one maze or in rooms of one density and level of noise."""
 
-    seen: bool | None = None  # the model was trained in this maze
+    seen: bool | None = None  # whether the model was trained in this maze
     margin_m: float | None = None  # references: clearance of their roadmap beyond the robot's radius
     action_scale: float | None = None  # references: share of the actuators' range that the controller uses
     worlds: int | None = None  # rooms
     pairs: int | None = None  # in each room
-    density: float | None = None  # of obstacles, 1 is the published one
-    noise: float | None = None  # 1 is a real robot's
-    full: int | None = None  # seven pairs: arrived and touched nothing
-    partial: int | None = None  # seven pairs: arrived and grazed something
-    failed: int | None = None  # seven pairs: the rest
-    trained: Mapping[str, Any] | None = None  # origin of the model, if the row's origin is that of a later evaluation
+    density: float | None = None  # of obstacles, relative to the published density
+    noise: float | None = None  # level of noise; 1 is a real robot
+    full: int | None = None  # seven pairs: goal reached without contact
+    partial: int | None = None  # seven pairs: goal reached with grazing contacts
+    failed: int | None = None  # seven pairs: all others
+    trained: Mapping[str, Any] | None = None  # origin of the model, if the row was measured later
 
     @property
     def subject(self) -> tuple[Any, ...]:
-        """The key of a row: a later row with the same key replaces it. References belong to no model."""
+        """The key of a row. A later row with the same key replaces it. The key of a reference has no model."""
         model = () if self.method in GUIDED else (self.variant, self.model_seed)
         # Rows of early commits have no ``margin_m``; their margin was 0.
         return (*model, self.method, self.maze, self.density, self.noise, self.margin_m or 0.0, self.action_scale)
@@ -119,7 +119,7 @@ class Row(Made, Scored):
 
 @dataclass(frozen=True, kw_only=True)
 class Unmade(Made):
-    """A row that could not be made, and the reason."""
+    """A missing row, and the reason."""
 
     why: str
 
@@ -177,8 +177,8 @@ LISTS = ("rows", "density", "noise", "seven")
 
 
 def add_results(file: Path, found: Results) -> None:
-    """Add results to a file. Rows of other commands are kept, with two exceptions: rows that are measured again, and
-    rows whose variant now has other settings. The latter are reported on stderr.
+    """Add results to a file. Existing rows are kept, with two exceptions: new rows replace rows with the same key, and
+    rows are dropped if the settings of their variant have changed. Dropped rows are reported on stderr.
 
     The reason for a missing row is removed once the row exists.
     """
@@ -203,7 +203,7 @@ def add_results(file: Path, found: Results) -> None:
 
 
 def replace_rows(file: Path, rows: Iterable[Kind], names: tuple[str, ...], kind: type[Kind]) -> list[Kind]:
-    """Write rows to a file. They replace rows that have the same values of ``names``. Returns all rows of the file."""
+    """Write rows to a file. They replace rows with the same values of ``names``. Returns all rows of the file."""
     rows = list(rows)
     subject = lambda row: tuple(getattr(row, name) for name in names)  # noqa: E731
     again = set(map(subject, rows))

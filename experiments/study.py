@@ -1,7 +1,7 @@
-"""Runs a robot's variants. A variant is a preset with plain overrides; it is trained and evaluated with each seed.
+"""Train and evaluate the variants of a robot with each seed. A variant is a preset with overrides.
 
-A finished run is used as it is; an interrupted run continues. Runs share stages with the same inputs, which are
-compared by their digests.
+A finished run is not repeated, and an interrupted run is continued. Runs share stages with the same inputs. The inputs
+are compared by their digests.
 """
 
 import functools
@@ -51,7 +51,7 @@ from ct_jax.terminal import printable
 from ct_jax.worlds import kind_of
 from ct_jax.worlds.maze_runs import make_env
 
-SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
+SAC_ALONE_ITERATIONS = 8000  # 500 episodes of the point
 
 
 # -------------------------------------------------------------------------------------------------------- variants
@@ -59,23 +59,23 @@ SAC_ALONE_ITERATIONS = 8000  # for the point: 500 full episodes
 
 @dataclass(frozen=True)
 class Variant:
-    """A row of a robot's table: a preset and its changes."""
+    """A row of a robot's table: a preset and its overrides."""
 
     preset: str
-    """"published" (at the size given by --preset) or "cpu"."""
+    """"published" (at the size of --preset) or "cpu"."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Settings by dotted name, such as "model.modes"; a value can be a function of the preset."""
+    """Overrides by dotted name, such as "model.modes"; a value can be a function of the preset."""
     label: str = ""
     """Name in tables (default: CT or F-CT with the variant's name)."""
     tuned_from: str | None = None
     """For a fine-tuned variant: the variant before fine-tuning."""
     baseline: CqlConfig | SacConfig | None = None
-    """The baseline that is trained in place of a transformer: CQL on the run's data, or SAC without data."""
+    """Baseline to train instead of a transformer: CQL on the run's data, or SAC without data."""
     sweeps: tuple[str, ...] = ()
     """Turtlebot3: further evaluations: "density", "noise", "seven"."""
 
     def settings(self, robot: str, preset: str = "cpu") -> Settings:
-        """The settings of its runs, with ``--preset preset``."""
+        """The settings of the variant's runs with ``--preset preset``."""
         size = "published" if preset == "cpu" else preset
         base = get_preset(size if self.preset == "published" else self.preset, robot)
         settings = base
@@ -91,7 +91,7 @@ def _set(config: Any, path: list[str], value: Any) -> Any:
 
 
 def half_the_updates(published: Settings) -> Any:
-    """The training after fine-tuning as published: half of the first training. The paper does not give its length."""
+    """Training in a round of fine-tuning as published. The paper gives no length; ours is half of the first."""
     return replace(published.fit, updates=published.fit.updates // 2, warmup=20)
 
 
@@ -101,7 +101,7 @@ def pt_cql_config(frame: str = "world") -> CqlConfig:
 
 
 def sac_alone_config(robot: str) -> SacConfig:
-    """SAC alone: the controller's learner in the whole maze. Longer paths need a larger discount factor."""
+    """Settings of SAC alone: the controller's learner in the whole maze. Longer paths need a larger discount factor."""
     sac = get_preset("cpu", robot).sac
     changes = {"discount": 0.99, "iterations": SAC_ALONE_ITERATIONS, "reward_scale": 0.1, "alive_bonus": 0.0}
     return replace(sac, **changes, **EDGES_ONLY)
@@ -120,7 +120,7 @@ ROBOTS = ("point", "ant", "humanoid", "turtlebot3")
 def choose(variants: Mapping[str, Variant], preset: str, names: tuple[str, ...] = ()) -> dict[str, Variant]:
     """The variants of a preset, or only those with the given names, in the order of the robot's file.
 
-    "cpu" has all variants; "published" and "paper" have the published ones, at their size; "demo" has only itself.
+    "cpu" has all variants. "published" and "paper" have the published variants, at their size. "demo" has one variant.
 
     Raises:
         UserError: the preset has no variant with a given name.
@@ -150,7 +150,7 @@ class Options:
     variants: tuple[str, ...] = ()
     """Variants to run (default: all of the preset)."""
     out: Path | None = None
-    """Folder of the runs (default: runs/ROBOT); finished runs are not repeated."""
+    """Folder of the runs (default: runs/ROBOT). Finished runs are not repeated."""
 
 
 @dataclass(frozen=True)
@@ -216,16 +216,16 @@ class Study:
         )  # fmt: skip
 
     def run(self, variants: Mapping[str, Variant], seeds: tuple[int, ...], keep: Callable[[Results], None]) -> Results:
-        """Train and evaluate all variants with each seed. If one fails, the others still run.
+        """Train and evaluate all variants with each seed. If a run fails, the others still run.
 
-        If F-CT finds no recoveries to learn from, that is a result too: its reason is kept instead of a row. Planner
-        and explorer appear once for each roadmap margin and each action scale.
+        If F-CT finds no recoveries to learn from, the reason is stored instead of a row. Planner and explorer have one
+        row for each roadmap margin and each action scale.
 
         Args:
             keep: called after each model with all results so far.
 
         Raises:
-            UserError: at the end, if some runs failed; it names them.
+            UserError: at the end, with the names of the failed runs.
         """
         prepare_jax()
         found, failed = Results(), []
@@ -257,7 +257,7 @@ class Study:
 
 
 def measure(run: Run, name: str, variant: Variant) -> list[Row]:
-    """The rows of a run. It is trained first unless it is finished."""
+    """The rows of a run. The run is trained first unless it is finished."""
     if variant.baseline is not None:
         found = BASELINES[type(variant.baseline)](run, variant.baseline)
     else:
@@ -267,7 +267,7 @@ def measure(run: Run, name: str, variant: Variant) -> list[Row]:
 
 
 def reference(run: Run) -> dict[str, float]:
-    """The settings by which planner and explorer differ between runs. In rooms there are none."""
+    """The settings that affect planner and explorer; in rooms there are none."""
     settings = run.settings
     if settings.rooms:
         return {}
@@ -277,7 +277,7 @@ def reference(run: Run) -> dict[str, float]:
 
 # ---------------------------------------------------------------------------------------------------------- stages
 
-# The settings that a stage depends on, besides those of the stage before it.
+# The settings that a stage depends on, in addition to those of the stage before it.
 STAGES = {
     "controller": ("prm", "controller", "sac"),
     "collect": ("controller_action_scale", "collect", "rooms", "random_mazes"),
@@ -287,7 +287,7 @@ _REFERENCES = ("episodes", "pairs_seed", "controller_action_scale")
 
 
 def stage_digests(run: Run) -> dict[str, str]:
-    """Digests of the inputs of each stage that runs can share; "evaluate" is for planner and explorer only."""
+    """Digests of the inputs of each stage that runs can share. "evaluate" covers planner and explorer only."""
     found = identity(run)
     settings: dict[str, Any] = found["settings"]
     where = {name: found[name] for name in ("robot", "mazes", "eval_mazes", "engine")}
@@ -297,7 +297,7 @@ def stage_digests(run: Run) -> dict[str, str]:
         inputs |= {name: settings.get(name) for name in names}
         digests[stage] = digest_words(inputs)
     asked = {name: settings.get(name) for name in _REFERENCES}
-    if run.settings.rooms:  # there, planner and explorer have their own roadmap and controller
+    if run.settings.rooms:  # in rooms, planner and explorer have their own roadmap and controller
         asked = {name: asked[name] for name in ("episodes", "pairs_seed")} | {"worlds": run.settings.rooms.worlds}
     else:
         asked["controller"] = digests["controller"]
@@ -322,7 +322,7 @@ def share(runs: list[Run], run: Run) -> None:
 
 def _copy_references(source: Path, folder: Path) -> None:
     folder.mkdir()
-    for ending in ("npz", "json"):  # the JSON file comes last: it shows that the row is complete
+    for ending in ("npz", "json"):  # the JSON file is copied last: it marks the row as complete
         for method in GUIDED:
             for file in source.glob(f"*-{method}.{ending}"):
                 shutil.copy(file, folder)
@@ -332,13 +332,13 @@ def _copy_references(source: Path, folder: Path) -> None:
 
 
 def label(run: Run, variant: str, values: dict[str, Any]) -> Row:
-    """A row with the origin of its model, or with its own origin if ``values`` has one."""
+    """A row of results. Its origin is that of the model, unless ``values`` has an origin."""
     made = made_of(run, variant, values["method"])
     return Row.read(made | (reference(run) if values["method"] in GUIDED else {}) | values)
 
 
 def made_of(run: Run, variant: str, method: str) -> dict[str, Any]:
-    """The values of ``rows.Made``."""
+    """The fields of ``rows.Made``."""
     config = read_json(run.folder / "config.json")
     stages = [*sorted(run.folder.glob("*/done.json")), run.folder / "baselines" / method / "done.json"]
     walls = {done.parent.name: read_json(done)["wall_s"] for done in stages if done.is_file()}
@@ -351,7 +351,7 @@ def made_of(run: Run, variant: str, method: str) -> dict[str, Any]:
     return made | origin_of(config)
 
 
-@functools.cache  # every row of a run needs it
+@functools.cache  # all rows of a run use the same digest
 def controller_digest(where: str, robot: str) -> str:
     """A digest of the low-level controller in a run's folder."""
     return digest_arrays(load_controller(where, robot)[0])
@@ -363,18 +363,18 @@ def digest_arrays(tree: Any) -> str:
 
 
 def digest_words(*values: Any) -> str:
-    """A digest of values that JSON can hold."""
+    """A digest of JSON values."""
     words = "".join(json.dumps(value, sort_keys=True) for value in values)
     return hashlib.sha256(words.encode()).hexdigest()[:12]
 
 
 def digest(settings: Settings, baseline: CqlConfig | SacConfig | None = None) -> str:
-    """Letters that tell settings apart, with those of a baseline."""
+    """A digest of settings, and of those of a baseline."""
     return digest_words(to_dict(settings), *([asdict(baseline)] if baseline else []))
 
 
 def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, dict[str, str]]:
-    """What a row's rates count, episode by episode, as ones and zeros: methods are compared pair by pair."""
+    """The outcome of each episode as ones and zeros, so that methods can be compared on each start-goal pair."""
     names = {"success": "success", "collision": "collided", "fall": "fell", "frontal": "frontal", "grazing": "grazing"}
     with np.load(episodes_file(folder, row["maze"], row["method"])) as episodes:
         found = {name: episodes[array] for name, array in names.items() if array in episodes}
@@ -387,28 +387,28 @@ def as_digits(flags: np.ndarray) -> str:
 
 
 def keep_once(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What a file holds; measured, and written with its origin, where it is not there."""
+    """The contents of a JSON file. If the file does not exist, measure its values and write them with their origin."""
     if not file.is_file():
         write_json(file, measure() | origin_of(provenance()))
     return read_json(file)
 
 
 def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
-    """Write down what the results in a file's folder are made from; returns the origin of the first writer.
+    """Record the inputs of the results in a file's folder; returns the origin of the first record.
 
     Args:
-        what: the word for the inputs.
+        what: the name of the inputs in the error.
 
     Raises:
-        UserError: the results there are made from something else.
+        UserError: the results in the folder have other inputs.
     """
-    inputs = json.loads(json.dumps(inputs, default=str))  # tuples as lists, as they are read back
+    inputs = json.loads(json.dumps(inputs, default=str))  # tuples become lists, as when the file is read
     if not file.is_file():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, {"of": inputs} | origin_of(provenance()))
     before = read_json(file)
     if before.get("of") != inputs:
-        raise UserError(f"{file.parent}: was made with other {what}; delete it, and it is made anew")
+        raise UserError(f"{file.parent}: was made with other {what}; delete it to make it again")
     return origin_of(before)
 
 
@@ -416,7 +416,7 @@ def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
 
 
 def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
-    """Rows of PT-CQL, learned from the run's planning trajectories, which are collected where they are missing."""
+    """Rows of PT-CQL. It is trained on the run's planning trajectories, which are collected first if needed."""
     with open_run(run, resume=True):
         metrics = Metrics(run.folder)
         controller, _ = kind_of(run.spec).controller(run, metrics)
@@ -432,7 +432,7 @@ def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, 
 
 
 def sac_alone(run: Run, config: SacConfig) -> list[dict[str, Any]]:
-    """Rows of SAC alone in the run's maze, without its data."""
+    """Rows of SAC alone, trained in the run's maze without the run's data."""
 
     def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
         return train_sac_alone(key, functools.partial(make_env, run), next(iter(run.mazes.values())), config, **watch)
@@ -446,7 +446,7 @@ BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: 
 def baseline(
     run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
 ) -> list[dict[str, Any]]:
-    """Rows of one baseline. It is trained first unless its weights exist."""
+    """Rows of one baseline. It is trained first unless it is finished."""
     frame, stage = config.frame, f"baselines/{name}"
     folder = run.folder / stage
     env = make_env(run, auto_reset=False)

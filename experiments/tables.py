@@ -18,14 +18,15 @@ from ct_jax.evaluate import GUIDED
 from ct_jax.settings import from_dict, to_dict
 
 ZOO = Path(__file__).parents[1] / "ct_jax" / "zoo"
-LONGER = "long-ct"  # CT with about as many updates as F-CT has in all
-# Success of the paper's CT [%] (sec. IV-A, table II; sec. IV-B); and the lifted variants, without and with fine-tuning.
+LONGER = "long-ct"  # CT with about the same total number of updates as F-CT
+# Success rates of the paper's CT [%] (sec. IV-A, table II; sec. IV-B).
 PAPER = {
     "point": {"antmaze-large": 84.33, "antmaze-large-eval": 60.33},
     "ant": {"antmaze-large": 90.0, "antmaze-large-eval": 77.33},
     "humanoid": {"antmaze-large": 19.0, "antmaze-large-eval": 18.0, "hall": 26.0},
     "turtlebot3": {"rooms": 92.47},
 }
+# Lifted variants without and with fine-tuning.
 _BOTH = ("cpu-ct", "cpu")
 LIFTED = {"point": ("cpu-ct", "roam"), "ant": ("calm+long-ct", "cpu")}
 
@@ -43,7 +44,7 @@ def put(text: str, name: str, lines: Sequence[str]) -> str:
     """The text with these lines between the markers called ``name``."""
     marked = re.compile(rf"(<!-- {re.escape(name)} -->\n).*?(<!-- /{re.escape(name)} -->)", re.DOTALL)
     if not marked.search(text):
-        print(f"no place for the table {name}", file=sys.stderr)
+        print(f"no markers for the table {name}", file=sys.stderr)
     return marked.sub(lambda found: found[1] + "\n".join(lines) + "\n" + found[2], text)
 
 
@@ -53,7 +54,7 @@ def made_by(
     """The command, commit, machine and date of rows, without repeated lines.
 
     Args:
-        names: the names of further columns on the left; ``cells`` gives their cells.
+        names: names of additional columns on the left; ``cells`` gives their cells.
     """
     found = dict.fromkeys((*cells(row), *_origin(row)) for row in rows)
     return grid([*names, "command", "commit", "machine", "date"], found)
@@ -123,7 +124,7 @@ def maze_tables(results: Results, variants: Mapping[str, Variant]) -> list[str]:
 
 
 def differences(results: Results, variants: Mapping[str, Variant]) -> list[str]:
-    """F-CT − CT in each maze, as published and lifted, pair by pair and model by model."""
+    """F-CT − CT in each maze, as published and lifted, computed for each pair and each model."""
     together, body = by_method(results.rows, variants), []
     names = {label_of(name, variants): variant.tuned_from for name, variant in variants.items() if variant.tuned_from}
     for (maze, name), tuned in together.items():
@@ -138,7 +139,7 @@ def reasons(unmade: Sequence[Unmade], variants: Mapping[str, Variant]) -> list[s
     """The reasons for missing rows."""
     ordered = sorted(unmade, key=lambda row: (row.variant, row.model_seed))
     body = [[method_name(row, variants), str(row.model_seed), row.why, *_origin(row)] for row in ordered]
-    return grid(["no row of", "seed", "reason", "command", "commit", "machine", "date"], body) if body else []
+    return grid(["missing row", "seed", "reason", "command", "commit", "machine", "date"], body) if body else []
 
 
 def runs_table(rows: Sequence[Row], variants: Mapping[str, Variant]) -> list[str]:
@@ -152,7 +153,7 @@ def runs_table(rows: Sequence[Row], variants: Mapping[str, Variant]) -> list[str
     for (who, *made), found in groups.items():
         seeds = "" if found[0].method in GUIDED else ", ".join(map(str, sorted({row.model_seed for row in found})))
         body.append([who, seeds, _minutes(found), *made])
-    return grid(["variant", "seeds", "minutes a model", "command", "commit", "machine", "date"], body)
+    return grid(["variant", "seeds", "minutes per model", "command", "commit", "machine", "date"], body)
 
 
 def _minutes(rows: Sequence[Row]) -> str:
@@ -163,7 +164,7 @@ def _minutes(rows: Sequence[Row]) -> str:
     walls = {row.model_seed: row.run_wall_s / 60 for row in timed}
     collected = [row.collect_wall_s / 60 for row in timed if row.collect_wall_s]
     words = f"{np.mean(list(walls.values())):.0f}"
-    return f"{words}, of them {np.mean(collected):.1f} to collect" if collected else words
+    return f"{words} ({np.mean(collected):.1f} for collection)" if collected else words
 
 
 # --------------------------------------------------------------------------------------------------------- summary
@@ -191,9 +192,9 @@ def summary_table(results: Mapping[str, Results]) -> list[str]:
             planners = sorted((row for row in rows if row.method == "planner"), key=lambda row: row.variant != ct)
             where = f"{maze} ({'seen' if rows and rows[0].seen else 'unseen'})"
             body.append([robot, where, f"{paper:g}", *cells, _together(planners[:1])])
-    others = "; ".join(f"of the {robot} `{ct}` and `{tuned}`" for robot, (ct, tuned) in LIFTED.items())
-    note = f"Success in % with its 95 % interval; n is the number of trained models. *Lifted*: `{_BOTH[0]}` and "
-    return [*grid(names, body), "", note + f"`{_BOTH[1]}`; {others}."]
+    others = ", ".join(f"{robot}: `{ct}` and `{tuned}`" for robot, (ct, tuned) in LIFTED.items())
+    note = "Success rate in % with its 95 % interval; n is the number of trained models. The *lifted* variants are "
+    return [*grid(names, body), "", note + f"`{_BOTH[0]}` and `{_BOTH[1]}` ({others})."]
 
 
 def _models(rows: Iterable[Row], variant: str) -> list[Row]:
@@ -202,7 +203,7 @@ def _models(rows: Iterable[Row], variant: str) -> list[Row]:
 
 
 def _together(rows: Sequence[Row]) -> str:
-    """Success [%] of all models with its interval, and the number of models; no number for a reference."""
+    """Success [%] over all models with its interval, and the number of models (not for a reference)."""
     if not rows:
         return "not measured"
     return pooled(rows, "success") + ("" if rows[0].method in GUIDED else f", n = {len(rows)}")
@@ -249,11 +250,11 @@ def _with_seed(row: Row) -> str:
 def transfer_table(rows: Sequence[TransferRow]) -> list[str]:
     """One line for each robot, run and start: success by number of updates, and the updates to 90 % of the final value.
 
-    The final success is the better of both starts' means after the last update. Between two measurements, success is
+    The final value is the mean success of the better start after the last update. Between two measurements, success is
     interpolated over the logarithm of the updates.
     """
     marks = sorted({row.updates for row in rows})
-    names = ["robot", "run", "start", "seeds", *(f"{mark}" for mark in marks), "90 % of the final at"]
+    names = ["robot", "run", "start", "seeds", *(f"{mark}" for mark in marks), "updates to 90 % of the final success"]
     curves: dict[tuple[str, str, str], dict[int, list[float]]] = {}
     for row in sorted(rows, key=lambda row: row.updates):
         curve = curves.setdefault((row.robot, row.run, start_of(row)), {})
@@ -337,7 +338,7 @@ def benchmark_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         theirs = f"{number(other)} {row['unit']}" if other is not None else ""
         aim = f"{row['asked']:.3g}" if row["asked"] else ""
         body.append([row["name"], figures, row["against"], theirs, shown, aim])
-    names = ["what", "median (min to max)", "compared with", "its median", "times as fast (min to max)", "aim"]
+    names = ["what", "median (min to max)", "compared with", "its median", "speed ratio (min to max)", "aim"]
     lines = grid(names, body)
     for words in dict.fromkeys(_made(row["made"]) for row in rows):
         lines += ["", words]
@@ -366,7 +367,7 @@ def model_card(robot: str, results: Results) -> dict[str, list[str]]:
     led = (settings["prm"]["margin_m"], None if scale == 1.0 else scale)
 
     def beside(row: Row) -> bool:
-        """Whether a row is the shipped model's, or a reference's with the same margin and action scale."""
+        """Whether a row belongs to the shipped model, or to a reference with the same margin and action scale."""
         if row.method in GUIDED:
             return robot == "turtlebot3" or (row.margin_m, row.action_scale) == led
         return (row.variant, row.model_seed, row.method) == (shipped, seed, CT)
@@ -374,7 +375,7 @@ def model_card(robot: str, results: Results) -> dict[str, list[str]]:
     found = Results(*([row for row in getattr(results, name) if beside(row)] for name in LISTS))
     tables = room_tables(found, "###") if robot == "turtlebot3" else maze_tables(found, load_variants(robot))
     measured = [row for name in LISTS for row in getattr(found, name) if row.method == CT]
-    made = [f"The rows of `{shipped}` were made by:", "", *made_by(measured)]
+    made = [f"Commands of the rows of `{shipped}`:", "", *made_by(measured)]
     return {"facts": _facts(model, robot, shipped), "metrics": [*tables, "", *made]}
 
 
@@ -386,11 +387,11 @@ def _facts(model: Mapping[str, Any], robot: str, shipped: str) -> list[str]:
     where = f"in `antmaze-large` and {mazes} random mazes" if mazes else "in `antmaze-large`"
     where = "in random rooms" if robot == "turtlebot3" else where
     data = f"{collect['trajectories']} trajectories {where}, guided by the {collect['guide']}; "
-    data += f"size of the disturbances {collect['noise']:g}"
+    data += f"action noise {collect['noise']:g}"
     training = f"{fit['updates']} updates with {fit['batch']} windows of {fit['steps']} steps"
     if rounds:
         training += f"; {rounds} rounds of fine-tuning with {recover['recoveries']} recoveries each, "
-        training += f"{last['updates']} updates in the last one"
+        training += f"{last['updates']} updates in the last round"
     weights = ZOO / robot / "weights.safetensors"
     body = [
         ["variant", f"`{shipped}` of `experiments/{robot}.py`, seed {model['made']['seed']}"],

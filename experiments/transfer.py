@@ -3,9 +3,9 @@
     python experiments/transfer.py [--robots ant point] [--point runs/point/cpu-0] [--ant runs/ant/cpu-0]
 
 Needs a finished run of each robot (``experiments/point.py``, ``experiments/ant.py``, or ``ct-jax train``). A new
-transformer is fitted to the planning trajectories of a robot's run, from scratch or from the trunk of the other
+transformer is trained on the planning trajectories of a robot's run, either from scratch or from the trunk of the other
 robot's model (``ct_jax.transfer``). During training it is evaluated in the unseen maze. Writes
-``experiments/results/transfer.json``; the curves of other runs and seeds are kept there.
+``experiments/results/transfer.json``, and keeps the curves of other runs and seeds.
 """
 
 import functools
@@ -46,20 +46,20 @@ class Options:
     ant: Path = Path("runs/ant/cpu-0")
     """A finished run of the ant."""
     robots: tuple[str, ...] = ("ant", "point")
-    """Robots to fit a transformer for, each with the trunk of the other."""
+    """Robots to train a transformer for, each with the trunk of the other robot."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the fits."""
+    """Seeds of the trainings."""
     marks: tuple[int, ...] = (50, 100, 200, 400, 800)
     """Numbers of updates after which to evaluate."""
     episodes: int = 100
     """Start-goal pairs."""
     out: Path = Path("runs/transfer")
-    """Folder of the curves; finished ones are not run again."""
+    """Folder of the curves. Finished curves are not repeated."""
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A robot that a transformer is fitted for."""
+    """A robot to train a transformer for, with its data."""
 
     model: TrainedModel
     data: Trajectories
@@ -70,7 +70,7 @@ class Target:
 
     @staticmethod
     def of(run: Path, updates: int) -> "Target":
-        """The robot of a finished run, with its trajectories, and its last fit's settings without decay of the rate."""
+        """The target of a finished run. Training uses the run's last settings, without decay of the learning rate."""
         model = load_model(str(run))
         settings = model.settings
         config = replace(settings.last_fit or settings.fit, updates=updates, decay=False, warmup=20)
@@ -91,7 +91,7 @@ class Target:
 def curve(
     target: Target, source: TrainedModel | None, seed: int, options: Options, folder: Path
 ) -> list[dict[str, Any]]:
-    """Success after each number of updates, from a source's trunk or from scratch; resumable."""
+    """Success after each number of updates, from a source's trunk or from scratch. Interrupted curves continue."""
     init_key, fit_key = jax.random.split(jax.random.key(seed))
     policy = target.model.policy
     params = init_params(init_key, policy.model, target.data, policy.params)
@@ -136,7 +136,7 @@ def measure(options: Options) -> list[TransferRow]:
                 head["source"] = runs[other].name if source else None
                 folder = options.out / f"{robot}-{runs[robot].name}" / f"{start}-{seed}"
                 models = [make(robot).model, *([source] if source else [])]
-                # A fit continues from the mark before. With a new mark in between it would start from later weights.
+                # Training continues from the previous mark. A new mark in between would start from later weights.
                 of = {
                     "models": [digest_arrays(model.policy.params) for model in models],
                     "episodes": options.episodes, "marks": sorted(options.marks),

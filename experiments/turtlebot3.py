@@ -2,16 +2,16 @@
 
     python experiments/turtlebot3.py [--preset cpu|demo|published] [--seeds 0 1 2] [--variants ct cpu] [--no-sweeps]
 
-With each seed it trains and evaluates: CT, BC-CT and F-CT as published, on the same 1000 planning trajectories; the
-lifted method with fine-tuning (``cpu``) and without (``cpu-ct``); the latter conditioned on the full predicted return
-(``cpu-ct-v``), or with past actions as inputs (``cpu-ct-actions``); both trained with noise (``noise``, ``noise-ct``);
-and ``cpu`` trained in rooms of many densities (``dense``). Planner and explorer are evaluated too.
+The variants, with each seed: CT, BC-CT and F-CT as published (``ct``, ``bc-ct``, ``f-ct``), on the same 1000 planning
+trajectories; the lifted method without and with fine-tuning (``cpu-ct``, ``cpu``); ``cpu-ct`` conditioned on V itself
+(``cpu-ct-v``), or with past actions as inputs (``cpu-ct-actions``); both trained with noise (``noise-ct``, ``noise``);
+``cpu`` trained in rooms of many densities (``dense``). Planner and explorer are evaluated too.
 
-Some variants of the first seed are then evaluated in rooms with 0.5 to 2 times the published density, with 0 to 2 times
+Some variants of the first seed are also evaluated in rooms with 0.5 to 2 times the published density, with 0 to 2 times
 the errors of a real robot, and on the paper's seven pairs in one fixed room.
 
-The same command continues an interrupted run. Writes ``experiments/results/turtlebot3-PRESET.json``; the rows of other
-seeds and variants are kept there.
+The same command continues an interrupted run. Writes ``experiments/results/turtlebot3-PRESET.json``, and keeps the rows
+of other seeds and variants.
 """
 
 import functools
@@ -32,13 +32,13 @@ from ct_jax.pipeline import answer, measured
 from ct_jax.run import Run
 from ct_jax.worlds.room_runs import Request, SevenPairs, grades
 
-DENSITIES = (0.5, 1.5, 2.0)  # besides 1, at which every variant is measured
-LEVELS = (0.5, 1.0, 2.0)  # besides 0, at which every variant is measured
+DENSITIES = (0.5, 1.5, 2.0)  # in addition to 1, which all variants have
+LEVELS = (0.5, 1.0, 2.0)  # in addition to 0, which all variants have
 SEVEN_LEVELS = (0.0, 1.0)
 SWEEPS = LISTS[1:]
 SWEPT_PAIRS = 10  # in each room of a sweep
 
-# Without fine-tuning: conditioned on half of V, and timesteps shifted at random.
+# No fine-tuning. The target return is half of V, and timesteps are shifted at random.
 LIFTED_CT = {"rounds": 0, "return_scale": 0.5, "fit.shift_timestep": 300}
 NOISE = {"rooms.noise": 1.0}  # the errors of a real robot, in training
 DENSE = {"rooms.density": min(DENSITIES), "rooms.densest": max(DENSITIES)}
@@ -64,9 +64,9 @@ class RoomOptions(Options):
     """What to run in rooms."""
 
     out: Path = Path("runs/turtlebot3")
-    """Folder of the runs; finished runs are not repeated."""
+    """Folder of the runs. Finished runs are not repeated."""
     sweeps: bool = True
-    """Also measure other densities, levels of noise, and the seven pairs."""
+    """Also evaluate at other densities, at other levels of noise, and on the seven pairs."""
 
 
 def run_all(options: RoomOptions) -> Path:

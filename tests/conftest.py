@@ -1,6 +1,6 @@
-"""What every test runs under: a CPU backend, few threads, a private compile cache, and strict shapes.
+"""The setup of all tests: a CPU backend, few threads, a private compilation cache, and strict shapes.
 
-jax and numpy read the environment variables once, when first imported, so they are set above those imports.
+jax and numpy read the environment variables at their first import, so the variables are set before these imports.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Most of a test's time is XLA compiling a program that runs for milliseconds.
+# Most of the time of a test is compilation. The compiled program runs for milliseconds.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 _workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
@@ -30,25 +30,24 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-# Compiled programs are kept between runs. A cache that others can write to can run their code: ours only.
+# Compiled programs are cached between runs. Only this user may write to the cache, because it contains code.
 _CACHE = Path(__file__).parent / ".jax_cache"
 _CACHE.mkdir(mode=0o700, exist_ok=True)
 _CACHE.chmod(0o700)
 jax.config.update("jax_compilation_cache_dir", str(_CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
-# An example that compiles takes as long as it takes: a deadline would only measure the machine.
+# No deadline: the time of an example depends on compilation and on the machine.
 hypothesis.settings.register_profile("ct_jax", deadline=None)
 hypothesis.settings.load_profile("ct_jax")
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Runs a test and its fixtures with rank promotion an error, so that (n, 1) never meets (n,) unnoticed.
+    """Run each test and its fixtures with rank promotion as an error, so that (n, 1) and (n,) are not combined.
 
-    MJX and brax (its running statistics) rely on rank promotion, so a test that steps them says so with
-    `@pytest.mark.rank_promotion("allow")`, or a whole file with `pytestmark = ...` of the same mark.
-    Flax, optax and Orbax work under "raise".
+    MJX and brax's running statistics need rank promotion. A test that uses them has
+    `@pytest.mark.rank_promotion("allow")`, or its file has this mark as `pytestmark`.
     """
     marker = item.get_closest_marker("rank_promotion")
     before = jax.config.jax_numpy_rank_promotion
@@ -59,33 +58,33 @@ def pytest_runtest_protocol(item):
         jax.config.update("jax_numpy_rank_promotion", before)
 
 
-# Each compiled program takes some of the 65530 memory maps that Linux grants a process; without one, XLA crashes. A
-# test without compilation has thousands of programs, one for each operation and shape: no process can keep them all.
+# Each compiled program uses some of the 65530 memory maps that Linux allows per process. Without a free memory map, XLA
+# crashes. A test without jit has thousands of programs, one for each operation and shape.
 _MANY_MAPS = 20_000
 
 
 def pytest_runtest_logreport(report):
-    """Forgets compiled programs where memory maps would run out. To count takes milliseconds: not after quick tests."""
+    """Clear compiled programs before memory maps run out. Counting takes milliseconds, so fast tests are skipped."""
     if report.duration > 2.0 and _memory_maps() > _MANY_MAPS:
         jax.clear_caches()
 
 
 def _memory_maps() -> int:
-    """How many memory maps this process has; 0 where there is no Linux to say so."""
+    """The number of memory maps of this process; 0 if the system is not Linux."""
     maps = Path("/proc/self/maps")
     return len(maps.read_bytes().splitlines()) if maps.is_file() else 0
 
 
 @pytest.fixture
 def jit_disabled():
-    """Runs the test operation by operation, so that asserts and Python errors inside jitted code are seen."""
+    """Run the test without jit, so that asserts and Python errors inside jitted code are raised."""
     with jax.disable_jit():
         yield
 
 
 @pytest.fixture(scope="session")
 def fork():
-    """Starts functions in processes that have everything imported, and have not begun with JAX."""
+    """Start functions in forked processes, which have imported everything but have not started JAX."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["ct_jax.pipeline", "ct_jax.report", "ct_envs.turtlebot3_pool"])
 
@@ -99,7 +98,7 @@ def fork():
 
 @pytest.fixture(scope="session")
 def wall_distance():
-    """Distance [m] from points [..., 2] to the nearest wall of a grid [H, W], in NumPy, wall by wall."""
+    """Distance [m] from points [..., 2] to the nearest wall of a grid [H, W]: a plain NumPy loop over the walls."""
 
     def distance(walls, points, cell_m=4.0):
         points = np.asarray(points, np.float64)
@@ -115,7 +114,7 @@ def wall_distance():
 
 @pytest.fixture(scope="session")
 def push():
-    """A controller that nobody trained, good for the point robot: the speed that is wanted, less the one there is."""
+    """An untrained controller for the point robot: the desired velocity minus the current velocity."""
     import jax.numpy as jnp
     from flax import struct
 
@@ -134,7 +133,7 @@ def push():
 
 @pytest.fixture(scope="session")
 def faulty():
-    """A policy that stands still; from a step on, its action is no finite number in the environments it is given."""
+    """A policy with zero actions. In given environments, its actions are not finite from a given step on."""
     import jax.numpy as jnp
     from flax import struct
 
@@ -160,7 +159,7 @@ def faulty():
 
 @pytest.fixture(scope="session")
 def toy_data():
-    """Makes random trajectories of the given lengths; ``proprio`` says which trajectory and step it is."""
+    """Make random trajectories of the given lengths. ``proprio`` contains the index of the trajectory and the step."""
     from ct_jax.trajectories import Trajectories
 
     def make(lengths, *, seed=0, mazes=1, steps=None, side_m=20.0):
@@ -192,12 +191,12 @@ ISLANDS = """\
 #...#...#
 #...#...#
 #########
-"""  # two regions: nobody can be asked to go from one to the other
+"""  # two separate regions
 
 
 @dataclasses.dataclass(frozen=True)
 class TinyRun:
-    """A finished run through the command line: what it was given, wrote and said. Copy the folder to change it."""
+    """A finished run of the command line: arguments, folder and output. Copy the folder before you change it."""
 
     folder: Path
     arguments: list[str]
@@ -207,7 +206,7 @@ class TinyRun:
 
 @pytest.fixture(scope="session")
 def tiny_settings():
-    """Settings of a run that takes seconds and learns nothing; every stage is there."""
+    """Settings of a run with all stages that takes seconds and learns nothing."""
     from ct_jax import settings as p
 
     fit = p.FitConfig(updates=40, batch=4, steps=8)
@@ -228,7 +227,7 @@ def tiny_settings():
 
 @pytest.fixture
 def tiny(monkeypatch, tiny_settings):
-    """Lets the command line know of a preset "tiny", with short episodes, and leaves jax as the tests have it."""
+    """Add a preset "tiny" with short episodes to the command line, and keep the JAX settings of the tests."""
     _know_tiny(monkeypatch, tiny_settings)
 
 
@@ -251,7 +250,7 @@ def islands(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory, tiny_settings, islands):
-    """A run that nothing interrupted, one for all workers. Whoever asks for it needs ``rank_promotion("allow")``."""
+    """An uninterrupted run, shared by all test workers. Tests that use it need ``rank_promotion("allow")``."""
     ours = tmp_path_factory.getbasetemp()
     root = ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours
     with (root / "tiny-run.lock").open("a") as lock:

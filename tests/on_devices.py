@@ -1,8 +1,8 @@
-"""What ``test_devices`` runs in processes of their own, each with its number of devices.
+"""The program of ``test_devices``. It runs in separate processes with different numbers of devices.
 
     python tests/on_devices.py FOLDER NAME [HOST:PORT PROCESSES PROCESS]
 
-From FOLDER/data.npz it trains, saves and goes on; it collects and evaluates; FOLDER/NAME.npz says what came of it.
+It trains on FOLDER/data.npz, saves and resumes, collects and evaluates, and writes the results to FOLDER/NAME.npz.
 """
 
 import contextlib
@@ -33,10 +33,10 @@ from ct_jax.value import ValueNetwork
 from ct_jax.worlds.mazes import MazeWorld
 
 FOLDER, NAME = Path(sys.argv[1]), sys.argv[2]
-interrupts.GRACE_S = 120.0  # on a busy machine, to stop by itself takes longer than the system would wait
+interrupts.GRACE_S = 120.0  # on a busy machine, stopping takes longer
 signals = contextlib.ExitStack()
-signals.enter_context(interruptible())  # before the processes meet, as the command line does
-if among := sys.argv[3:]:  # before anything asks JAX for its devices
+signals.enter_context(interruptible())  # before the processes connect, as in the command line
+if among := sys.argv[3:]:  # before JAX starts devices
     devices.start(among[0], int(among[1]), int(among[2]))
 
 UPDATES = 20
@@ -52,7 +52,7 @@ PRM = PrmConfig(samples=30)
 
 @struct.dataclass
 class Push:
-    """A controller that nobody trained."""
+    """An untrained controller."""
 
     action_size: int = struct.field(pytree_node=False, default=2)
 
@@ -66,7 +66,7 @@ def learner() -> tuple[Fit, dict]:
 
 
 def empty(n: int, steps: int) -> Trajectories:
-    """Trajectories of the point robot of which nothing is known but their sizes."""
+    """Empty trajectories of the point robot with these sizes."""
     shapes = {"position": 2, "proprio": 2, "action": 2, "label": 2, "reward": 0, "label_mask": 0, "collision": 0}
     arrays = {name: np.zeros((n, steps, size) if size else (n, steps), np.float32) for name, size in shapes.items()}
     counts = {name: np.zeros(n, np.int32) for name in ("maze", "length")}
@@ -74,8 +74,8 @@ def empty(n: int, steps: int) -> Trajectories:
 
 
 def train() -> dict[str, np.ndarray]:
-    """Losses of the first half of the updates, after which a signal comes (to the last of several processes); of all
-    of them; and of the second half again, from the checkpoints of all whom the signal stopped.
+    """Losses of three trainings: the first half of the updates, which a signal to the last process ends; all updates;
+    and the second half, resumed from the checkpoints of the first training.
     """
     data, (made, params) = load(FOLDER / "data.npz"), learner()
 
@@ -87,7 +87,7 @@ def train() -> dict[str, np.ndarray]:
             if update == stop < UPDATES:
                 if jax.process_index() == jax.process_count() - 1:
                     os.kill(os.getpid(), signal.SIGTERM)
-                raise_if_interrupted()  # as a bar does
+                raise_if_interrupted()  # as in a progress bar
 
         with contextlib.suppress(KeyboardInterrupt), contextlib.closing(Checkpoints(checkpoints)) as manager:
             fit(
@@ -96,13 +96,13 @@ def train() -> dict[str, np.ndarray]:
         return np.array(found)
 
     result = {"half": losses(FOLDER / "checkpoints" / NAME, stop=UPDATES // 2)}
-    signals.close()  # or the thread that watches for a program that does not stop would end this one
+    signals.close()  # otherwise the watching thread would end this process
     result["losses"] = losses(FOLDER / f"none-{NAME}")
     return result | {f"from-{saved.name}": losses(saved) for saved in sorted((FOLDER / "checkpoints").iterdir())}
 
 
 def traffic() -> dict[str, np.ndarray]:
-    """Elements of the largest array that any device is sent whole, and of the largest that it holds a part of."""
+    """Sizes of the largest replicated array and of the largest shard that a device receives."""
     made, params = learner()
     data, rtg = spread(load(FOLDER / "data.npz"), made.mesh)
     mazes = devices.place(MAZES, devices.replicated(made.mesh))

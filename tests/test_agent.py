@@ -1,4 +1,4 @@
-"""A loaded policy acts on observations of one's own as it acts in an evaluation, and says what is wrong with them."""
+"""Agent: a loaded policy acts on given observations as in an evaluation, and wrong observations are errors."""
 
 import functools
 
@@ -23,7 +23,7 @@ def agent_of(robot):
 
 
 def observe(robot, n=N, seed=0):
-    """Observations that mean nothing, of the right shapes and types."""
+    """Random observations with the right shapes and types."""
     rng, proprio = np.random.default_rng(seed), sizes(robot)[0]
     return {
         "map": rng.integers(0, 2, (n, 2, 25, 25)).astype(np.uint8),
@@ -42,8 +42,8 @@ def act_along(agent, observations, rewards):
 
 
 @pytest.mark.rank_promotion("allow")
-def test_an_agent_acts_as_in_an_evaluation():
-    """On what the environment shows, the very actions that the rollout of an evaluation records."""
+def test_agent_acts_as_in_an_evaluation():
+    """For the observations of an evaluation, the actions equal the recorded ones."""
     model, agent = ct_jax.load("zoo:point"), agent_of("point")
     env = MazeEnv("point", engine="mujoco", auto_reset=False, map_cell_m=model.settings.model.map_cell_m)
     mazes = stack_mazes([load_maze("antmaze-umaze")] * N)
@@ -60,7 +60,7 @@ def test_an_agent_acts_as_in_an_evaluation():
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_a_batch_of_one_acts_as_a_row_of_many(robot):
+def test_batch_of_one_equals_row_of_larger_batch(robot):
     agent = agent_of(robot)
     seen = [observe(robot, seed=step) for step in range(3)]
     rewards = [np.full(N, -float(step), np.float32) for step in range(3)]
@@ -84,7 +84,7 @@ def test_each_batch_size_compiles_once(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float16, jnp.float32])
-def test_floats_of_any_size_will_do(kind):
+def test_floats_of_any_precision_are_accepted(kind):
     seen = observe("turtlebot3")
     other = seen | {"goal": seen["goal"].astype(np.float16).astype(kind)}
     same = seen | {"goal": seen["goal"].astype(np.float16).astype(np.float32)}
@@ -119,7 +119,7 @@ WRONG = {
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("fault", WRONG)
-def test_a_wrong_observation_is_told_in_one_line(robot, fault):
+def test_wrong_observation_is_error_of_one_line(robot, fault):
     agent, (spoil, words) = agent_of(robot), WRONG[fault]
     with pytest.raises(ct_jax.UserError, match=words) as told:
         agent.init(spoil(observe(robot)))
@@ -135,14 +135,14 @@ def test_a_wrong_observation_is_told_in_one_line(robot, fault):
         (np.full(N, np.nan), "'reward' is not finite in row 0"),
     ],
 )
-def test_a_wrong_reward_is_told(reward, words):
+def test_wrong_reward_is_error(reward, words):
     agent, seen = agent_of("point"), observe("point")
     memory = agent.init(seen)
     with pytest.raises(ct_jax.UserError, match=words):
         agent.act(memory, seen, reward)
 
 
-def test_a_memory_that_is_not_of_these_episodes_is_told():
+def test_memory_of_other_episodes_is_error():
     agent, seen = agent_of("point"), observe("point")
     others = [agent.init(observe("point", 1)), agent_of("turtlebot3").init(observe("turtlebot3")), None, 3.0]
     for memory in others:
@@ -150,7 +150,7 @@ def test_a_memory_that_is_not_of_these_episodes_is_told():
             agent.act(memory, seen, np.zeros(N))
 
 
-def test_inside_a_compiled_program_the_way_out_is_told():
+def test_error_inside_jit_names_the_alternative():
     agent = agent_of("point")
     with pytest.raises(ct_jax.UserError, match=r"inside jax\.jit, use the agent's policy"):
         jax.jit(agent.init)(observe("point"))

@@ -1,4 +1,4 @@
-"""The ant: its body, its falls, its limbs at walls, and both engines moving it alike."""
+"""The ant: its body, falls, contacts of its limbs with walls, and the agreement of both engines."""
 
 import functools
 
@@ -36,7 +36,7 @@ def keys(seed: int, n: int = N) -> jax.Array:
 
 
 def lay(state, which, quat):
-    """The state with some of its robots turned to an attitude."""
+    """The state with some robots rotated to a given attitude."""
     physics = state.pipeline_state
     qpos = jnp.where(jnp.asarray(which)[:, None], physics.qpos.at[:, 3:7].set(jnp.array(quat)), physics.qpos)
     return state.replace(pipeline_state=physics.replace(qpos=qpos))
@@ -45,7 +45,7 @@ def lay(state, which, quat):
 # ----------------------------------------------------------------------------------------------------- the body
 
 
-def test_the_body_is_that_of_gymnasiums_ant():
+def test_body_equals_gymnasium_ant():
     """Numbers of the ``ant.xml`` of gymnasium 1.4.0 (Ant-v5), computed by MuJoCo. It has the same joints in the same
     order, so its whole mass matrix, here in a bent pose, can be compared."""
     model = mujoco.MjModel.from_xml_string(model_xml(ANT))
@@ -73,7 +73,7 @@ def test_the_body_is_that_of_gymnasiums_ant():
     np.testing.assert_allclose(matrix[3:6, 6:].sum(), 0.14189087, atol=1e-8)
 
 
-def test_it_stands_when_left_alone():
+def test_ant_stands_without_actions():
     reset, step = compiled(auto_reset=False, maps=False)
     state = reset(keys(0, 16), UMAZE, STANDING)
     for _ in range(30):
@@ -83,7 +83,7 @@ def test_it_stands_when_left_alone():
     assert np.linalg.norm(np.asarray(state.info["position"]) - 6.0, axis=-1).max() < 0.2
 
 
-def test_it_begins_upright_and_looks_anywhere():
+def test_reset_is_upright_with_random_heading():
     state = compiled(auto_reset=False, maps=False)[0](keys(1, 200), UMAZE, STANDING)
     heading, own = own_frame(state.obs["proprio"])
     np.testing.assert_allclose(own[:, 1:4], [[0.0, 0.0, 1.0]] * 200, atol=1e-6)
@@ -94,7 +94,7 @@ def test_it_begins_upright_and_looks_anywhere():
 # -------------------------------------------------------------------------------------------------------- falls
 
 
-def test_a_fall_is_a_failure_and_leaves_the_others_alone():
+def test_fall_is_failure_of_its_own_environment_only():
     reset, step = compiled(auto_reset=False, maps=False)
     state = reset(keys(2), UMAZE, STANDING)
     fallen = np.array([False, True, False, False])
@@ -106,14 +106,14 @@ def test_a_fall_is_a_failure_and_leaves_the_others_alone():
         np.testing.assert_array_equal(np.asarray(a)[~fallen], np.asarray(b)[~fallen])
 
 
-def test_a_fall_at_the_goal_is_no_success():
+def test_fall_at_goal_is_not_success():
     reset, step = compiled(auto_reset=False, maps=False)
     state = lay(reset(keys(3), UMAZE, STANDING.replace(goal=STANDING.start)), [True, False] * 2, [0.0, 1.0, 0.0, 0.0])
     after = step(state, jnp.zeros((N, 8)))
     np.testing.assert_array_equal(after.info["success"], [0, 1, 0, 1])
 
 
-def test_an_exploded_robot_ends_its_own_episode_only(monkeypatch, tmp_path):
+def test_diverged_state_ends_its_own_episode_only(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
     reset, step = compiled(maps=False)
     state = reset(keys(4), UMAZE, STANDING)
@@ -128,7 +128,7 @@ def test_an_exploded_robot_ends_its_own_episode_only(monkeypatch, tmp_path):
     assert not np.asarray(after.info["success"]).any()
 
 
-def test_after_a_success_a_chained_task_begins_where_the_robot_is():
+def test_following_task_starts_at_current_position():
     reset, step = compiled(maps=False)
     goal = jnp.array([[6.1, 6.0], [10.0, 6.0]])
     tasks = Tasks(jnp.full((2, 2), 6.0), goal, jnp.array(1), follow=jnp.array([[1, 1], [0, 0]]))
@@ -146,7 +146,7 @@ def test_after_a_success_a_chained_task_begins_where_the_robot_is():
 # ---------------------------------------------------------------------------------------------- walls and engines
 
 
-def test_every_limb_is_stopped_by_walls_and_floor():
+def test_all_limbs_collide_with_walls_and_floor():
     model = build_model(ANT)
     limbs = [i for i in range(model.ngeom) if model.geom(i).name.startswith(("torso", "stub", "leg", "foot"))]
     obstacles = [i for i in range(model.ngeom) if model.geom(i).name.startswith(("wall", "floor"))]
@@ -157,7 +157,7 @@ def test_every_limb_is_stopped_by_walls_and_floor():
             assert met | (model.geom_contype[obstacle] & model.geom_conaffinity[limb])
 
 
-def test_a_leg_in_a_wall_is_a_collision_and_pushed_out():
+def test_leg_in_wall_is_collision_and_is_pushed_out():
     engine = make_engine("mujoco", ANT)
     walls = np.ones((5, 5), bool)
     walls[1:4, 1:4] = False
@@ -176,7 +176,7 @@ def test_a_leg_in_a_wall_is_a_collision_and_pushed_out():
     assert state.qpos[1, 1] < 15.12 and (state.qpos[2, :2] < 15.12).all()
 
 
-def test_a_maze_too_narrow_for_it_is_refused():
+def test_too_narrow_maze_is_error():
     with pytest.raises(UserError, match=r"no room for a robot of radius 1\.0 m"):
         narrow = make_maze(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), cell_m=0.5)
         build_roadmap(jax.random.key(0), narrow, radius_m=ANT.radius_m)

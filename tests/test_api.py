@@ -1,4 +1,4 @@
-"""``import ct_jax``: the public names, and the numerics that a caller's settings do not change."""
+"""``import ct_jax``: the public names, and results that do not depend on the caller's JAX settings."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ from ct_jax.types import act_as_intended
 
 SUBMODULES = sorted(f"ct_jax.{module.name}" for module in pkgutil.iter_modules(ct_jax.__path__))
 
-# Each public name is that of an object that stays the same, whatever is imported, in the given order.
+# Each public name is the same object for any order of imports.
 SAME = """
 import importlib, sys
 import ct_jax
@@ -37,27 +37,27 @@ for name, it in then.items():
 
 
 def run_python(text: str) -> str:
-    """What a process of its own prints."""
+    """The output of a separate process."""
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_no_public_name_is_that_of_a_submodule():
+def test_public_names_differ_from_submodules():
     assert not set(ct_jax.__all__) & {name.removeprefix("ct_jax.") for name in SUBMODULES}
 
 
 @pytest.mark.parametrize(("names_first", "modules"), [(True, SUBMODULES), (False, SUBMODULES[::-1])])
-def test_a_public_name_is_the_same_object_whatever_is_imported_first(names_first, modules):
+def test_public_name_does_not_depend_on_import_order(names_first, modules):
     run_python(SAME.format(names_first=names_first, modules=modules))
 
 
-def test_the_package_alone_imports_nothing_heavy():
+def test_import_of_package_is_light():
     said = run_python("import sys, ct_jax\nprint([m for m in ('jax', 'numpy', 'ct_envs') if m in sys.modules])")
     assert said.strip() == "[]"
 
 
-def test_every_name_is_listed_and_no_other_is_there():
+def test_all_lists_exactly_the_public_names():
     assert set(ct_jax.__all__) == set(ct_jax._SOURCE) <= set(dir(ct_jax))
     with pytest.raises(AttributeError, match="has no attribute 'unicorn'"):
         _ = ct_jax.unicorn  # pyright: ignore
@@ -68,14 +68,14 @@ def test_every_name_is_listed_and_no_other_is_there():
 
 @contextlib.contextmanager
 def other_settings():
-    """Settings of a program that has others than ours."""
+    """JAX settings that differ from ours."""
     with jax.default_matmul_precision("bfloat16"), jax.numpy_rank_promotion("raise"), jax.enable_x64(True):
         yield
 
 
 @pytest.mark.rank_promotion("allow")
-def test_python_and_the_command_line_evaluate_alike(tiny_run):
-    """Bit for bit, whatever the caller's settings are; and these stay as they are."""
+def test_python_and_command_line_evaluate_equally(tiny_run):
+    """The rows are equal bit for bit for other JAX settings of the caller, and these settings do not change."""
     folder, out = str(tiny_run.folder), io.StringIO()
     with contextlib.redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
         patch.setattr("ct_jax.cli.prepare_jax", lambda *_: None)
@@ -92,7 +92,7 @@ def test_python_and_the_command_line_evaluate_alike(tiny_run):
 
 @struct.dataclass
 class Witness:
-    """A policy, or a controller, that keeps the text of a product that is compiled where it is."""
+    """A policy or controller that stores the text of a compiled product."""
 
     said: list = struct.field(pytree_node=False)
     action_size: int = struct.field(pytree_node=False, default=2)
@@ -141,7 +141,7 @@ def recover(witness):
 
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.parametrize("entry", [evaluate, act, collect, recover])
-def test_products_are_exact_in_what_is_compiled(entry):
+def test_compiled_products_are_exact(entry):
     witness = Witness([])
     with jax.default_matmul_precision("bfloat16"):
         entry(witness)

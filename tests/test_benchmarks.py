@@ -1,4 +1,4 @@
-"""The benchmarks' harness: contestants in turn, ratios pair by pair, results in files; and the dry run on paper."""
+"""The harness of the benchmarks: contestants in turn, ratios per round, results in files; and the scaling estimate."""
 
 import ast
 import itertools
@@ -26,7 +26,7 @@ BENCHMARKS = pathlib.Path(_harness.__file__).parent
 
 
 class Clock:
-    """Time that passes only where a contestant says so."""
+    """A clock that only contestants advance."""
 
     def __init__(self, monkeypatch):
         self.now, self.order = 0.0, []
@@ -47,7 +47,7 @@ def results(tmp_path, monkeypatch, **options) -> Results:
     return Results(str(tmp_path / "it.py"), Options(**options))
 
 
-def test_contestants_take_turns_after_a_warm_up(monkeypatch):
+def test_contestants_run_in_turn_after_warm_up(monkeypatch):
     clock = Clock(monkeypatch)
     a, b = clock.contestant("a", 9.0, 1.0, 3.0), clock.contestant("b", 9.0, 2.0, 4.0)
     assert time_together(a, b, repeat=2) == [[1.0, 3.0], [2.0, 4.0]]
@@ -55,13 +55,13 @@ def test_contestants_take_turns_after_a_warm_up(monkeypatch):
 
 
 @pytest.mark.parametrize(("limit_s", "rounds"), [(100.0, 5), (12.0, 3), (0.0, 2)])
-def test_a_race_that_takes_long_has_fewer_rounds_but_two(monkeypatch, limit_s, rounds):
+def test_slow_race_has_fewer_rounds_but_at_least_two(monkeypatch, limit_s, rounds):
     clock = Clock(monkeypatch)
     a, b = clock.contestant("a", 1.0), clock.contestant("b", 4.0)
     assert time_together(a, b, repeat=5, limit_s=limit_s) == [[1.0] * rounds, [4.0] * rounds]
 
 
-def test_what_compiles_nothing_has_no_warm_up(monkeypatch):
+def test_contestant_without_compilation_has_no_warm_up(monkeypatch):
     clock = Clock(monkeypatch)
     a, b = clock.contestant("a", 1.0), replace(clock.contestant("b", 2.0), compiles=False)
     assert time_together(a, b, repeat=2) == [[1.0] * 2, [2.0] * 2]
@@ -69,8 +69,8 @@ def test_what_compiles_nothing_has_no_warm_up(monkeypatch):
 
 
 @pytest.mark.parametrize(("unit", "value", "other"), [("steps/s", 4.0, 1.0), ("ms", 250.0, 1000.0)])
-def test_a_ratio_says_how_many_times_as_fast_ours_is(tmp_path, monkeypatch, unit, value, other):
-    """Whatever is counted: for each unit of work, pair by pair."""
+def test_ratio_is_relative_speed(tmp_path, monkeypatch, unit, value, other):
+    """For all units, per unit of work and per round."""
     clock = Clock(monkeypatch)
     race = results(tmp_path, monkeypatch, repeat=3, limit_s=60.0)
     ours, rival = clock.contestant("a", 1.0, 2.0, 1.0, 1.0, work=4.0), clock.contestant("b", 2.0, work=2.0)
@@ -80,8 +80,8 @@ def test_a_ratio_says_how_many_times_as_fast_ours_is(tmp_path, monkeypatch, unit
     assert row["ratio"] == {"median": 4.0, "min": 2.0, "max": 4.0}
 
 
-def test_results_are_written_to_a_file_of_their_own_and_nowhere_else(tmp_path, monkeypatch, capsys):
-    """However often: the benchmark's source stays as it is."""
+def test_results_are_written_to_one_file_only(tmp_path, monkeypatch, capsys):
+    """The source of the benchmark does not change."""
     source = tmp_path / "it.py"
     source.write_text('"""What it does."""\n')
     for times in (1, 2):
@@ -95,7 +95,7 @@ def test_results_are_written_to_a_file_of_their_own_and_nowhere_else(tmp_path, m
     assert sorted(file.name for file in tmp_path.rglob("*")) == ["it.json", "it.py", "results"]
 
 
-def test_an_accelerator_has_a_file_of_its_own(tmp_path, monkeypatch):
+def test_accelerator_has_separate_results_file(tmp_path, monkeypatch):
     monkeypatch.setattr(_harness.jax, "default_backend", lambda: "gpu")
     race = results(tmp_path, monkeypatch)
     race.add("a step", "ms", [1.0])
@@ -103,7 +103,7 @@ def test_an_accelerator_has_a_file_of_its_own(tmp_path, monkeypatch):
     assert [file.name for file in (tmp_path / "results").iterdir()] == ["it-gpu.json"]
 
 
-def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
+def test_results_are_not_written_with_write_false(tmp_path, monkeypatch):
     race = results(tmp_path, monkeypatch, write=False)
     race.add("a", "ms", [1.0])
     race.finish()
@@ -111,12 +111,12 @@ def test_nothing_is_kept_unless_asked(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("file", sorted(BENCHMARKS.glob("[a-z]*.py")), ids=lambda file: file.stem)
-def test_a_benchmark_says_how_it_is_run(file):
+def test_docstring_of_benchmark_has_its_command(file):
     assert f"python benchmarks/{file.name}" in (ast.get_docstring(ast.parse(file.read_text())) or "")
 
 
-def test_a_row_has_the_commit_that_make_bench_began_with(tmp_path, monkeypatch):
-    """The results that the benchmarks before it wrote are no change of the code."""
+def test_row_has_commit_from_start_of_make_bench(tmp_path, monkeypatch):
+    """Results of earlier benchmarks do not count as changes of the code."""
     monkeypatch.setenv(_harness.COMMIT, "as-it-was")
     race = results(tmp_path, monkeypatch)
     race.add("a step", "ms", [1.0])
@@ -124,12 +124,12 @@ def test_a_row_has_the_commit_that_make_bench_began_with(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "results/it.json").read_text())[0]["made"]["commit"] == "as-it-was"
 
 
-def test_a_missing_peer_is_said(capsys):
+def test_missing_peer_is_reported(capsys):
     assert has_peer("json", "JSON") and not has_peer("no_such_peer", "Nobody")
     assert capsys.readouterr().out == "Nobody is not installed, so it is not measured: pip install -e '.[bench]'\n"
 
 
-def test_the_python_loop_builds_the_same_roadmap():
+def test_python_loop_builds_same_roadmap():
     maze = load_maze("antmaze-large")
     roadmap = prm_benchmark.building(maze, 60)()
     walls = np.asarray(maze.walls).tolist()
@@ -138,7 +138,7 @@ def test_the_python_loop_builds_the_same_roadmap():
     table = prm_benchmark.loop_table(graph)
     expected, distance = np.asarray(roadmap.table.next_hop), np.asarray(roadmap.table.distance)
     for goal, hops in table.items():
-        for node, hop in hops.items():  # as short, if not the same: two ways may be
+        for node, hop in hops.items():  # the hop may differ if two paths have the same length
             assert hop == expected[node, goal] or np.isclose(
                 distance[node, hop] + distance[hop, goal], distance[node, goal], rtol=1e-5
             )
@@ -158,7 +158,7 @@ def test_the_python_loop_builds_the_same_roadmap():
 
 
 def scale_options(tmp_path, **rows: float) -> scale.ScaleOptions:
-    """Options whose results hold the named rows alone, as if of two cores."""
+    """Options with results that contain only the given rows, from a machine with two cores."""
     names = {
         "collected": ("rollout", "point, collection guided by explorer", "trajectories/s"),
         "roadmap": ("prm", "200 samples: build and table", "ms"),
@@ -180,24 +180,24 @@ SIZES = scale.Sizes(trajectory=10_000, step=20, parameters=10**6, state=3 * 10**
 
 
 @pytest.mark.parametrize("missing", MEASURED)
-def test_a_figure_that_is_missing_names_its_benchmark(tmp_path, missing):
+def test_missing_measurement_names_its_benchmark(tmp_path, missing):
     options = scale_options(tmp_path, **{name: value for name, value in MEASURED.items() if name != missing})
     with pytest.raises(UserError, match=r"has no row '.*' in .*; run: python benchmarks/\w+\.py$"):
         scale.main(options)
     assert not options.page.exists()
 
 
-def test_the_page_is_computed_from_what_was_measured(tmp_path):
+def test_page_is_computed_from_measurements(tmp_path):
     options = scale_options(tmp_path, **MEASURED)
     scale.main(options)
     page = options.page.read_text()
     assert "| point, collection guided by explorer | 10 trajectories/s | x86_64 CPU, 2 cores, commit 0 |" in page
-    assert page.count("| memory of a GPU |") == 3 and "## What breaks first" in page and "nan" not in page
+    assert page.count("| memory of a GPU |") == 3 and "## Limits and remedies" in page and "nan" not in page
 
 
 @pytest.mark.parametrize("robot", ["point", "ant"])
-def test_an_update_that_a_gpu_was_measured_at_is_taken_from_there(tmp_path, robot):
-    """Not another robot's, though: then a CPU's is taken."""
+def test_measured_update_time_of_gpu_is_used(tmp_path, robot):
+    """A measurement of another robot is not used; then that of the CPU is."""
     options = scale_options(tmp_path, **MEASURED)
     made = {"hardware": "1 x NVIDIA, x86_64 CPU, 16 cores", "commit": "0"}
     rows = [
@@ -211,8 +211,8 @@ def test_an_update_that_a_gpu_was_measured_at_is_taken_from_there(tmp_path, robo
         assert scale.update_s(found, scale.Assumed()) == 1 / 200.0
 
 
-def test_more_hosts_hold_less_and_say_more(tmp_path):
-    """Memory, computation and roadmaps shrink as hosts grow, traffic does not."""
+def test_more_hosts_need_less_memory_and_more_communication(tmp_path):
+    """Memory, computation and roadmaps shrink with the number of hosts; communication does not."""
     options = scale_options(tmp_path, **MEASURED)
     settings, assumed = scale.get_preset("paper", "point"), scale.Assumed()
     found = scale.measured(options, settings.prm.samples)
@@ -227,14 +227,14 @@ def test_more_hosts_hold_less_and_say_more(tmp_path):
     assert loads == sorted(loads, reverse=True)
 
 
-def test_results_that_cannot_be_written_are_told_before_anything_is_timed(tmp_path, monkeypatch):
+def test_unwritable_results_are_error_before_timing(tmp_path, monkeypatch):
     (tmp_path / "results").write_text("mine")
     with pytest.raises(UserError, match=f"^{tmp_path / 'results'}: cannot be written"):
         results(tmp_path, monkeypatch)
     results(tmp_path, monkeypatch, write=False)
 
 
-def test_a_benchmark_without_a_device_is_one_line(tmp_path):
+def test_benchmark_without_device_is_error_of_one_line(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "nonsense"}
     command = [sys.executable, str(BENCHMARKS / "prm.py"), "--no-write"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path)

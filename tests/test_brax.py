@@ -1,4 +1,4 @@
-"""``MazeEnv`` under brax's training wrappers and PPO: an episode that is begun anew is whole again."""
+"""``MazeEnv`` with brax's training wrappers and PPO: a restarted episode has its original goal and step count."""
 
 import functools
 
@@ -24,12 +24,12 @@ def point(*, maps=False, **options) -> MazeEnv:
 
 
 def keys(seed: int) -> jax.Array:
-    return jax.random.split(jax.random.PRNGKey(seed), N)  # brax's wrappers want keys of the old kind
+    return jax.random.split(jax.random.PRNGKey(seed), N)  # brax's wrappers need old-style keys
 
 
 @pytest.mark.parametrize("auto_reset", [True, False])
 @pytest.mark.parametrize(("horizon", "length"), [(8, 100), (100, 8)], ids=["its horizon", "brax's"])
-def test_after_a_reset_by_brax_goal_and_clock_are_those_of_the_first_episode(auto_reset, horizon, length):
+def test_reset_by_brax_restores_goal_and_steps(auto_reset, horizon, length):
     env = brax.envs.training.wrap(point(auto_reset=auto_reset, horizon=horizon), length, 1)
     step, state = jax.jit(env.step), jax.jit(env.reset)(keys(0))
     first, ends = state, []
@@ -47,12 +47,12 @@ def test_after_a_reset_by_brax_goal_and_clock_are_those_of_the_first_episode(aut
         )
         assert all(jax.tree.leaves(same)), same
     lengths = [np.diff(np.flatnonzero(each), prepend=-1) for each in np.stack(ends).T]
-    assert max(map(max, lengths)) == 8  # some episode ends by time
+    assert max(map(max, lengths)) == 8  # some episodes reach the time limit
     for each in lengths:  # the same start, goal and actions: the same episode again
         assert len(each) >= 7 and (each == each[0]).all()
 
 
-def test_whoever_puts_in_another_pipeline_state_is_told_of_it():
+def test_info_follows_replaced_pipeline_state():
     env = point()
     reset, tasks = jax.jit(env.reset), Tasks(jnp.array([[6.0, 6.0]]), jnp.array([[14.0, 14.0]]), jnp.array(1))
     one, other = reset(jax.random.key(0), None, tasks), reset(jax.random.key(1))
@@ -63,7 +63,7 @@ def test_whoever_puts_in_another_pipeline_state_is_told_of_it():
 
 
 @pytest.mark.parametrize("maps", [False, True])
-def test_a_flat_observation_is_the_entries_of_the_dict(maps):
+def test_flat_observation_concatenates_the_dict(maps):
     env = point(maps=maps, auto_reset=False, horizon=3)
     flat = FlatObservation(env)
     assert flat.observation_size == 4 + maps * 2 * 25 * 25 and flat.action_size == 2
@@ -78,7 +78,7 @@ def test_a_flat_observation_is_the_entries_of_the_dict(maps):
 
 
 def test_ppo_trains(monkeypatch):
-    """brax's PPO asks for a function that jax has no more."""
+    """brax's PPO needs a function that was removed from jax."""
     copies = lambda tree, devices: jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)  # noqa: E731
     monkeypatch.setattr(jax, "device_put_replicated", copies, raising=False)
     small = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}

@@ -1,4 +1,4 @@
-"""Every setting is checked where it is built: by Python, by the command line and from a file, and in one line."""
+"""Settings are checked when they are created: from Python, from the command line and from a file."""
 
 import dataclasses
 import functools
@@ -21,11 +21,11 @@ CONFIGS = [
     CollectConfig, CqlConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, RoomConfig, SacConfig, Settings,
     Turtlebot3Config, ValueConfig,
 ]  # fmt: skip
-FREE_TEXT = {"Settings.controller", "Turtlebot3Config.urdf"}  # folder and file
+FREE_TEXT = {"Settings.controller", "Turtlebot3Config.urdf"}  # names of a folder and a file
 
 
 def unbounded(hint) -> list[object]:
-    """Numbers without a range and texts without choices in an annotation."""
+    """The numbers without a range and the texts without choices in an annotation."""
     if get_origin(hint) is Annotated:
         base, *notes = get_args(hint)
         if any(isinstance(note, Within) for note in notes):
@@ -47,21 +47,21 @@ def refusal(build) -> str:
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_every_setting_says_what_it_may_be(config):
+def test_all_settings_have_ranges_or_choices(config):
     hints = get_type_hints(config, include_extras=True)
     assert hints.keys() == {field.name for field in fields(config)}
     loose = {f"{config.__name__}.{name}" for name, hint in hints.items() if unbounded(hint)}
     assert loose <= FREE_TEXT
 
 
-def test_a_loose_setting_is_found():
+def test_unbounded_setting_is_found():
     assert unbounded(int) == unbounded(tuple[int, ...]) == unbounded(int | None) == [int]
     assert not unbounded(Annotated[int, Within(1, 2)] | None)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_the_command_line_builds_every_config(config):
-    """tyro understands the annotations; what they forbid ends in its error box, not in a traceback."""
+def test_command_line_builds_all_configs(config):
+    """tyro accepts the annotations. A forbidden value gives an error of tyro, not a traceback."""
     assert tyro.cli(config, args=[]) == config()
     for name, hint in get_type_hints(config).items():
         if hint is int:
@@ -81,7 +81,7 @@ WRONG = [
     (ModelConfig, {"stride": 0}, "stride is 0"),
     (ModelConfig, {"context_acting": -5}, "context_acting is -5"),
     (ModelConfig, {"context_acting": 10**9}, "context_acting is 1000000000"),
-    (ModelConfig, {"context_acting": 10**5000}, "context_acting is a int too large to be shown"),
+    (ModelConfig, {"context_acting": 10**5000}, "context_acting is too large to be shown (int)"),
     (ModelConfig, {"map_cell_m": 0}, "map_cell_m is 0; give a number above 0, at most 100"),
     (ModelConfig, {"map_cell_m": "x"}, "map_cell_m is 'x'"),
     (ModelConfig, {"map_cell_m": float("nan")}, "map_cell_m is nan"),
@@ -97,7 +97,7 @@ WRONG = [
     (Settings, {"model": FitConfig()}, "give a ModelConfig"),
     (Settings, {"rooms": 3}, "give a RoomConfig or None"),
     (Settings, {"controller": "a\nb"}, "a line of text"),
-    (SacConfig, {"hidden": "ab"}, "hidden is 'ab'; give a tuple of entries, from 1 to 16 of them"),
+    (SacConfig, {"hidden": "ab"}, "hidden is 'ab'; give a tuple of 1 to 16 entries"),
     (SacConfig, {"hidden": [8]}, "hidden is [8]"),
     (SacConfig, {"hidden": ()}, "hidden is ()"),
     (SacConfig, {"hidden": (8, 0)}, "for each entry a whole number from 1 to 16384"),
@@ -121,14 +121,14 @@ WRONG = [
 @pytest.mark.parametrize(
     ("config", "values", "words"), WRONG, ids=lambda value: value if isinstance(value, str) else "-"
 )
-def test_a_wrong_setting_is_one_line_that_says_what_to_give(config, values, words):
-    """Whether it is built anew or made of another."""
+def test_wrong_setting_is_error_of_one_line_with_allowed_values(config, values, words):
+    """For a new config, and for ``dataclasses.replace``."""
     assert words in refusal(lambda: config(**values))
     assert words in refusal(lambda: replace(config(), **values))
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_configs_stay_static_arguments(config):
+def test_configs_are_static_arguments(config):
     assert hash(config()) == hash(config()) and config() == replace(config())
     traced = []
 
@@ -141,7 +141,7 @@ def test_configs_stay_static_arguments(config):
     assert len(traced) == 1
 
 
-def test_whole_numbers_are_numbers_too():
+def test_integers_are_accepted_as_floats():
     assert PrmConfig(connect_m=9) == PrmConfig(connect_m=9.0)
 
 
@@ -157,7 +157,7 @@ class Outer(Checked):
     other: Inner | None = None
 
 
-def test_json_comes_back_as_the_config_it_was():
+def test_json_round_trip_is_identity():
     for config in (Outer(), Outer(Inner(0.25, ()), Inner(1, (3,)))):
         assert from_json(Outer, dataclasses.asdict(config), "outer") == config
         lists = {"inner": {"share": config.inner.share, "sizes": list(config.inner.sizes)}}
@@ -170,19 +170,19 @@ def test_json_comes_back_as_the_config_it_was():
         (None, "outer is None; give an object"),
         ([], "outer is []"),
         ({}, "'inner' is missing"),
-        ({"inner": {}, "colour": 1}, "another version: this one knows no 'colour'"),
-        ({"inner": {"shore": 1}}, "outer.inner of another version: this one knows no 'shore'"),
+        ({"inner": {}, "colour": 1}, "another version: 'colour' is unknown"),
+        ({"inner": {"shore": 1}}, "outer.inner of another version: 'shore' is unknown"),
         ({"inner": {"share": 2}}, "outer.inner.share is 2; give a number from 0 to 1"),
         ({"inner": {"sizes": {}}}, "outer.inner.sizes is {}"),
         ({"inner": {}, "other": 3}, "outer.other is 3"),
         ({"inner": {}, "other": {"share": "1"}}, "outer.other.share is '1'"),
     ],
 )
-def test_json_that_is_wrong_is_named_by_its_place(values, words):
+def test_wrong_json_is_error_with_its_path(values, words):
     assert words in refusal(lambda: from_json(Outer, values, "outer"))
 
 
-def test_settings_of_a_file_are_named_by_their_place():
+def test_wrong_settings_in_file_are_error_with_their_path():
     for name, value, words in (
         ("layers", "3", "settings.model.layers is '3'; give a whole number from 1 to 64"),
         ("heads", 3, "settings.model: ModelConfig.width is 128; give a multiple of heads, 3"),
@@ -198,5 +198,5 @@ def test_anything_can_be_shown():
         deep = [deep]
     for value in (deep, 10**5000, "x" * 1000, "a\nb", {"a": 10**5000}, float("nan")):
         assert len(shown(value)) <= 60 and shown(value).isprintable()
-    while deep:  # taken apart step by step: Python itself would go as deep
+    while deep:  # take it apart in steps: Python would recurse
         deep = deep.pop()

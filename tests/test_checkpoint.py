@@ -1,4 +1,4 @@
-"""What is kept on disk comes back as it was, or with an error that says which file and why."""
+"""Files on disk are restored exactly, or give an error with the file and the reason."""
 
 import errno
 import json
@@ -49,7 +49,7 @@ def assert_same(a, b) -> None:
 # ------------------------------------------------------------------------------------------------ checkpoints
 
 
-def test_a_state_comes_back_with_its_keys(tmp_path):
+def test_state_round_trip_includes_random_keys(tmp_path):
     kept = Checkpoints(tmp_path / "states")
     assert kept.restore(state()) is None
     kept.save(7, state(3))
@@ -62,11 +62,11 @@ def test_a_state_comes_back_with_its_keys(tmp_path):
     again.close()
 
 
-def test_the_newest_comes_back_and_few_are_kept(tmp_path):
+def test_newest_state_is_restored_and_old_ones_are_deleted(tmp_path):
     kept = Checkpoints(tmp_path / "states", keep=2)
     for step in (1, 2, 5):
         kept.save(step, state(step))
-    kept.save(5, state(9))  # is there already
+    kept.save(5, state(9))  # this step exists already
     step, found = kept.restore(state())
     kept.close()
     assert step == 5
@@ -74,7 +74,7 @@ def test_the_newest_comes_back_and_few_are_kept(tmp_path):
     assert sorted(int(p.name) for p in (tmp_path / "states").iterdir() if p.name.isdigit()) == [2, 5]
 
 
-def test_it_saves_now_and_then(tmp_path, monkeypatch):
+def test_maybe_save_saves_at_intervals(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
     kept = Checkpoints(tmp_path / "states", every_s=60.0)
@@ -86,7 +86,7 @@ def test_it_saves_now_and_then(tmp_path, monkeypatch):
 
 
 def saved(folder, *steps, size=1000):
-    """Checkpoints of these steps; each state holds its step many times."""
+    """Checkpoints of these steps. Each state contains its step number many times."""
     kept = Checkpoints(folder)
     for step in steps:
         kept.save(step, {"a": np.full(size, step, np.float32)})
@@ -94,7 +94,7 @@ def saved(folder, *steps, size=1000):
 
 
 def restored(folder, size=1000):
-    """The newest state that is whole, as (step, its numbers)."""
+    """The newest undamaged state, as (step, its numbers)."""
     kept = Checkpoints(folder)
     found = kept.restore({"a": np.zeros(size, np.float32)})
     kept.close()
@@ -115,8 +115,8 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_whatever_happens_to_a_file_the_one_before_is_taken(tmp_path, damage, capsys):
-    """Each file of the newest checkpoint in turn, the manifest too; one line says so, and training can go on."""
+def test_damaged_checkpoint_falls_back_to_previous(tmp_path, damage, capsys):
+    """Each file of the newest checkpoint is damaged in turn, also the manifest. One line reports it."""
     saved(tmp_path / "first", 1, 2)
     state = tmp_path / "first" / "2" / "default"
     manifest = (state / checkpoint.MANIFEST).read_text()
@@ -134,7 +134,7 @@ def test_whatever_happens_to_a_file_the_one_before_is_taken(tmp_path, damage, ca
 
 
 @pytest.mark.parametrize("change", ["nothing", "one line", "one file more"])
-def test_a_manifest_is_of_all_files_or_the_state_is_not_trusted(tmp_path, change):
+def test_manifest_must_cover_exactly_all_files(tmp_path, change):
     saved(tmp_path, 1, 2)
     state = tmp_path / "2" / "default"
     manifest = state / checkpoint.MANIFEST
@@ -148,7 +148,7 @@ def test_a_manifest_is_of_all_files_or_the_state_is_not_trusted(tmp_path, change
     assert restored(tmp_path) == (1, {1.0})
 
 
-def test_where_none_is_whole_training_begins_anew(tmp_path, capsys):
+def test_training_restarts_if_all_checkpoints_are_damaged(tmp_path, capsys):
     saved(tmp_path, 1, 2)
     for step in (1, 2):
         one_bit(tmp_path / str(step) / "default" / checkpoint.MANIFEST)
@@ -156,7 +156,7 @@ def test_where_none_is_whole_training_begins_anew(tmp_path, capsys):
     assert capsys.readouterr().err.count("warning: ") == 2
 
 
-def test_the_manifest_is_one_that_other_tools_read(tmp_path):
+def test_manifest_has_format_of_sha256sum(tmp_path):
     saved(tmp_path, 1)
     checked = subprocess.run(
         ["sha256sum", "--check", "--strict", checkpoint.MANIFEST], cwd=tmp_path / "1" / "default", capture_output=True
@@ -165,8 +165,8 @@ def test_the_manifest_is_one_that_other_tools_read(tmp_path):
 
 
 @pytest.mark.parametrize("limit", [0, 300, 10_000, 100_000])
-def test_a_disk_that_fills_up_leaves_what_was_saved(tmp_path, limit):
-    """No file may grow beyond a limit: what the system then says is what it says of a full disk, but for the number."""
+def test_full_disk_keeps_earlier_checkpoints(tmp_path, limit):
+    """A limit of the file size stands for a full disk. The system's error differs only in its number."""
     saved(tmp_path, 1)
     kept = Checkpoints(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -182,7 +182,7 @@ def test_a_disk_that_fills_up_leaves_what_was_saved(tmp_path, limit):
 
 
 @pytest.mark.parametrize("failing", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_called_so(tmp_path, failing, monkeypatch):
+def test_error_of_full_disk_names_the_reason(tmp_path, failing, monkeypatch):
     def full(folder):
         raise OSError(failing, os.strerror(failing), str(folder))
 
@@ -193,7 +193,7 @@ def test_a_full_disk_is_called_so(tmp_path, failing, monkeypatch):
     assert restored(tmp_path) is None
 
 
-def test_a_signal_waits_for_what_is_being_saved(tmp_path, monkeypatch):
+def test_signal_is_handled_after_save(tmp_path, monkeypatch):
     write = checkpoint._write_manifest
 
     def signalled(folder):
@@ -214,21 +214,21 @@ TREE = {
 }
 
 
-def test_weights_come_back_as_they_were(tmp_path):
-    """Also in a structure of shapes only, transposed in memory, and single numbers."""
+def test_weights_round_trip_is_identity(tmp_path):
+    """Also for a structure that has only shapes, for arrays that are transposed in memory, and for scalars."""
     turned = TREE | {"t": jnp.arange(6.0).reshape(2, 3).T, "n": np.arange(6, dtype=np.int32).reshape(2, 3).T}
     save_weights(tmp_path / "w.safetensors", turned)
     assert_same(load_weights(tmp_path / "w.safetensors", turned), turned)
     assert_same(load_weights(tmp_path / "w.safetensors", jax.eval_shape(lambda: turned)), turned)
 
 
-def test_the_same_weights_are_the_same_file(tmp_path):
+def test_same_weights_give_same_file(tmp_path):
     for name in "abcdefgh":
         save_weights(tmp_path / name, TREE, of={"robot": "point"})
     assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
 
 
-def test_other_weights_are_refused_with_both_shapes(tmp_path):
+def test_other_weights_are_error_with_both_shapes(tmp_path):
     file = tmp_path / "w.safetensors"
     save_weights(file, TREE)
     wider = {"layer": {"kernel": jnp.zeros((2, 5)), "bias": jnp.ones(3)}}
@@ -239,7 +239,7 @@ def test_other_weights_are_refused_with_both_shapes(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "half", "pickle", "text", "one bit"])
-def test_damaged_weights_are_refused(tmp_path, damage):
+def test_damaged_weights_are_error(tmp_path, damage):
     file = tmp_path / "w.safetensors"
     save_weights(file, TREE)
     whole = file.read_bytes()
@@ -257,7 +257,7 @@ def test_damaged_weights_are_refused(tmp_path, damage):
 
 
 class Trap:
-    """Writes a file when it is unpickled."""
+    """An object that writes a file when it is unpickled."""
 
     def __init__(self, file):
         self.file = file
@@ -269,21 +269,21 @@ class Trap:
 # ------------------------------------------------------------------------------------------------------- JSON
 
 
-def test_json_comes_back(tmp_path):
+def test_json_file_round_trip_is_identity(tmp_path):
     value = {"a": [1, 2.5, None, "ä"], "b": {"c": True}}
     write_json(tmp_path / "x.json", value)
     assert read_json(tmp_path / "x.json") == value
-    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]  # nothing half-written is left
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]  # no unfinished file remains
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path):
+def test_failed_write_keeps_old_file(tmp_path):
     write_json(tmp_path / "x.json", {"old": 1})
     with pytest.raises(TypeError):
         write_json(tmp_path / "x.json", {"new": object()})
     assert read_json(tmp_path / "x.json") == {"old": 1}
 
 
-def test_json_errors_name_the_file_and_the_line(tmp_path):
+def test_json_errors_name_file_and_line(tmp_path):
     file = tmp_path / "x.json"
     file.write_text(json.dumps({"a": 1, "b": 2}, indent=2).replace("2", "two"))
     with pytest.raises(UserError, match=r"x\.json:3: not JSON"):
@@ -309,14 +309,14 @@ def test_json_errors_name_the_file_and_the_line(tmp_path):
     ],
     ids=lambda text: text[:12],
 )
-def test_numbers_and_depths_that_json_has_not_are_one_line(tmp_path, text, words):
+def test_invalid_numbers_and_deep_nesting_are_error_of_one_line(tmp_path, text, words):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(UserError, match=rf"x\.json: {words}.*; mend it") as caught:
         read_json(tmp_path / "x.json", hint="mend it")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path):
+def test_unreadable_values_are_not_written(tmp_path):
     write_json(tmp_path / "x.json", {"old": 1})
     with pytest.raises(UserError, match=r"x\.json: cannot be written \(a number is infinite or NaN\)"):
         write_json(tmp_path / "x.json", {"new": float("nan")})

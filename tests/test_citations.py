@@ -1,4 +1,4 @@
-"""Citations of the paper: sections, tables, algorithms and figures that are cited exist, and fit the citing module."""
+"""Citations of the paper: cited sections, tables, algorithms and figures exist, and fit the module that cites them."""
 
 import re
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ SECTIONS = {
 TABLES = {"I": "hyperparameters", "II": "results in mazes"}
 ALGORITHMS = {"1": "the whole method", "2": "controller", "3": "collection", "4": "recoveries"}
 FIGURES = {str(number) for number in range(1, 8)}
-# Sections that a module may cite. A module that begins to cite the paper takes its place here.
+# The sections that each module may cite. Add modules that cite the paper here.
 TOPICS = {
     "prm": {"III-A", "III-G"},
     "roadmap": {"III-A"},
@@ -79,13 +79,13 @@ def topic_of(file: Path) -> str:
 
 
 def citations(text: str, kind: str) -> Iterator[str]:
-    """The numbers that a text cites of a kind: "III-A", "I", "4"."""
+    """The cited numbers of one kind in a text, such as "III-A", "I", "4"."""
     for match in KINDS[kind][0].finditer(text):
         yield next(number for number in match.groups() if number)
 
 
 def wrong_citations(text: str) -> list[str]:
-    """Citations of what the paper does not have, and lists of sections that are not written in full."""
+    """Citations that do not exist in the paper, and lists of sections that are abbreviated."""
     missing = [
         f"{kind} {number}"
         for kind, (_, known) in KINDS.items()
@@ -96,16 +96,16 @@ def wrong_citations(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("file", [*MODULES, *TESTS, *PAGES], ids=name_of)
-def test_what_is_cited_exists(file):
+def test_citations_exist_in_paper(file):
     assert not wrong_citations(file.read_text("utf-8"))
 
 
 @pytest.mark.parametrize("file", MODULES, ids=name_of)
-def test_a_module_cites_the_sections_of_its_topic(file):
+def test_module_cites_sections_of_its_topic(file):
     assert set(citations(file.read_text("utf-8"), "section")) <= TOPICS.get(topic_of(file), set())
 
 
-def test_every_topic_is_a_module():
+def test_all_topics_are_modules():
     assert TOPICS.keys() <= {topic_of(file) for file in MODULES}
     assert {section for allowed in TOPICS.values() for section in allowed} <= SECTIONS.keys()
 
@@ -125,5 +125,5 @@ def test_every_topic_is_a_module():
         ("(paper, sec. III-D and III-F, table II, figure 6, Algorithm 4; sec. IV)", []),
     ],
 )
-def test_a_wrong_citation_is_found(text, found):
+def test_wrong_citation_is_found(text, found):
     assert wrong_citations(text) == found

@@ -1,4 +1,4 @@
-"""The command line as other tools rely on it: what it takes, what it prints, and one line for bad input."""
+"""The command line: arguments, output, and errors of one line for bad input."""
 
 import errno
 import json
@@ -27,14 +27,14 @@ ROW = (
 
 
 def shell(*arguments, **options):
-    """Run ``python ...`` as a person would, in a process of its own."""
+    """Run ``python ...`` in a separate process."""
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"} | options.pop("env", {})
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment, **options)
 
 
 def refused(capsys, *arguments):
-    """The one line with which a command is refused."""
+    """The error line of a command."""
     capsys.readouterr()
     assert main([str(each) for each in arguments]) == 2
     out, err = capsys.readouterr()
@@ -45,7 +45,7 @@ def refused(capsys, *arguments):
 # ---------------------------------------------------------------------------------------------------- the commands
 
 
-def test_train_prints_the_table_and_where_things_are(tiny_run):
+def test_train_prints_table_and_paths(tiny_run):
     lines = tiny_run.stdout.splitlines()
     assert lines[0].split()[:3] == ["maze", "method", "success"]
     assert [line.split()[0] for line in lines[1:7]] == ["islands"] * 3 + ["antmaze-umaze"] * 3
@@ -54,7 +54,7 @@ def test_train_prints_the_table_and_where_things_are(tiny_run):
 
 
 @pytest.mark.parametrize(("rates", "shown"), [([0.0, 0.0], False), ([0.0, 0.25], True), ([None, None], False)])
-def test_the_table_tells_of_divergence_only_where_there_was_some(capsys, rates, shown):
+def test_table_shows_divergence_only_if_it_occurred(capsys, rates, shown):
     row = {"maze": "hall", "method": "ct", "success_rate": 0.5, "success_ci95": [0.1, 0.9], "spl": 0.5}
     row |= {"return_scaled": -1.0, "collision_rate": 0.0, "steps_mean": 3.0}
     cli.print_rows([row | ({} if rate is None else {"diverged_rate": rate}) for rate in rates])
@@ -62,8 +62,8 @@ def test_the_table_tells_of_divergence_only_where_there_was_some(capsys, rates, 
     assert ("diverged %" in out) == shown and ("25" in out) == shown
 
 
-def test_json_is_the_only_thing_on_stdout(tiny_run, islands):
-    """Through a real process, where libraries print what they like."""
+def test_json_is_only_output_on_stdout(tiny_run, islands):
+    """In a real process, where libraries may print."""
     done = shell(
         "-m", "ct_jax.cli", "evaluate", str(tiny_run.folder), "--maze", str(islands), "--episodes", "2", "--seed", "3",
         "--method", "planner", "--json", env={"XDG_CACHE_HOME": str(tiny_run.folder.parent / "cache")},
@@ -76,15 +76,15 @@ def test_json_is_the_only_thing_on_stdout(tiny_run, islands):
     assert 0 <= row["success_ci95"][0] <= row["success_rate"] <= row["success_ci95"][1] <= 1
 
 
-def test_imports_say_nothing():
-    """Not of the libraries that are looked for, either; nor does an experiment, before its help."""
+def test_imports_print_nothing():
+    """Missing optional libraries print nothing either. The first output of an experiment is its help."""
     assert shell("-c", "from ct_envs import MazeEnv").stdout == ""
     assert shell("experiments/point.py", "--help", cwd=ROOT).stdout.lstrip().startswith("usage:")
 
 
 @pytest.mark.parametrize("method", ["ct", "planner", "explorer"])
-def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
-    """The same seed means the same pairs, in the run and afterwards."""
+def test_evaluate_reproduces_row_of_run(method, tiny, tiny_run, capsys):
+    """The same seed gives the same pairs in the run and afterwards."""
     whole = [r for r in pipeline.results(tiny_run.folder) if (r["maze"], r["method"]) == ("antmaze-umaze", method)]
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4", "--method", method]
     assert main([*command, "--json"]) == 0
@@ -93,7 +93,7 @@ def test_evaluate_gives_the_row_of_the_run(method, tiny, tiny_run, capsys):
         assert row[name] == pytest.approx(whole[0][name]), name
 
 
-def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
+def test_evaluate_uses_given_return_scale(tiny_run, monkeypatch, capsys):
     asked = []
 
     def listen(request, model, method, seed, keep):
@@ -104,14 +104,14 @@ def test_evaluate_asks_for_as_much_as_it_is_told(tiny_run, monkeypatch, capsys):
     monkeypatch.setattr(pipeline, "answer", listen)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     rows = []
-    for more in ([], ["--return_scale", "0.5"]):
+    for more in ([], ["--return-scale", "0.5"]):
         assert main([*command, *more]) == 0
         rows.append(json.loads(capsys.readouterr().out))
     assert asked == [Settings().return_scale, 0.5]
     assert "return_scale" not in rows[0] and rows[1]["return_scale"] == 0.5
 
 
-def test_without_pybullet_every_other_robot_works(tiny_run, monkeypatch, capsys):
+def test_other_robots_work_without_pybullet(tiny_run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--json"]
     assert main(command) == 0
@@ -119,7 +119,7 @@ def test_without_pybullet_every_other_robot_works(tiny_run, monkeypatch, capsys)
     assert "needs PyBullet" in refused(capsys, "evaluate", "zoo:turtlebot3", "--worlds", "1", "--pairs", "1")
 
 
-def test_evaluate_prints_a_table_for_people(tiny, tiny_run, tmp_path, capsys):
+def test_evaluate_prints_table(tiny, tiny_run, tmp_path, capsys):
     arguments = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "4"]
     assert main([*arguments, "--picture", str(tmp_path / "paths.svg")]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -127,14 +127,14 @@ def test_evaluate_prints_a_table_for_people(tiny, tiny_run, tmp_path, capsys):
     assert "point, ct in antmaze-umaze: " in (tmp_path / "paths.svg").read_text()
 
 
-def test_report_is_written_again(tiny, tiny_run, tmp_path, capsys):
+def test_report_command_writes_report(tiny, tiny_run, tmp_path, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     (folder / "report.html").unlink()
     assert main(["report", str(folder)]) == 0
     assert capsys.readouterr().out == f"{folder / 'report.html'}\n" and (folder / "report.html").is_file()
 
 
-def test_mazes_shows_every_maze(capsys):
+def test_mazes_shows_all_mazes(capsys):
     assert main(["mazes"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in maze_names()) and "██" in out
@@ -153,7 +153,7 @@ def test_version(capsys):
         (["train"], ["examples:", "--resume", "runs/ROBOT-PRESET-SEED", "cell is 4 m wide"]),
         (
             ["evaluate"],
-            ["RUN", "--maze", "--episodes", "--seed", "--method", "--return_scale", "--json", "zoo:point", "examples:"],
+            ["RUN", "--maze", "--episodes", "--seed", "--method", "--return-scale", "--json", "zoo:point", "examples:"],
         ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
@@ -161,17 +161,17 @@ def test_version(capsys):
         (["evaluate"], ["mjx is some 30 times slower"]),
     ],
 )
-def test_help_teaches(command, words, capsys):
+def test_help_contains_options_and_examples(command, words, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*command, "--help"])
     out, err = capsys.readouterr()
     assert stop.value.code == 0 and err == ""
-    out = " ".join(out.split())  # as if there were no ends of lines
+    out = " ".join(out.split())  # ignore line breaks
     assert [word for word in words if word not in out] == []
 
 
 @pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["mazes"], ["train", "bob"], ["train"]])
-def test_what_needs_no_physics_does_not_wait_for_it(arguments):
+def test_light_commands_do_not_import_physics(arguments):
     heavy = ["mujoco", "brax", "orbax", "tensorboardX", "matplotlib"] + ["jax"] * (arguments != ["mazes"])
     code = f"""
 import sys
@@ -217,9 +217,9 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["evaluate", "RUN", "--episodes", "1000000000"], ["--episodes 1000000000", "to"]),
         (["evaluate", "RUN", "--episodes", "ten"], ["--episodes", "'ten'", "whole number"]),
         (["evaluate", "RUN", "--seed", "-1"], ["--seed -1", "0 to"]),
-        (["evaluate", "RUN", "--return_scale", "0"], ["--return_scale 0", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--return_scale", "nan"], ["--return_scale nan", "above 0, at most 10"]),
-        (["evaluate", "RUN", "--return_scale", "0.5", "--method", "explorer"], ["--return_scale", "--method ct"]),
+        (["evaluate", "RUN", "--return-scale", "0"], ["--return-scale 0", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return-scale", "nan"], ["--return-scale nan", "above 0, at most 10"]),
+        (["evaluate", "RUN", "--return-scale", "0.5", "--method", "explorer"], ["--return-scale", "--method ct"]),
         (["evaluate", "RUN", "--picture", "nowhere/paths.png"], ["--picture nowhere/paths.png", "folder"]),
         (["evaluate", "RUN", "--picture", "paths.gif"], ["--picture paths.gif", ".png, .svg, .pdf"]),
         (["evaluate", "RUN", "--video", "walk.gif"], ["--video walk.gif", ".mp4"]),
@@ -229,12 +229,12 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["report", "nowhere"], ["nowhere"]),
     ],
 )
-def test_bad_arguments_are_named_with_the_mend(arguments, words, tiny, tiny_run, capsys):
+def test_bad_arguments_are_error_with_remedy(arguments, words, tiny, tiny_run, capsys):
     line = refused(capsys, *(str(tiny_run.folder) if each == "RUN" else each for each in arguments))
     assert [word for word in words if word not in line] == [], line
 
 
-def test_a_real_process_says_one_line_too():
+def test_error_in_real_process_is_one_line():
     done = shell("-m", "ct_jax.cli", "train", "point", "--preset", "huge", env={"XDG_CACHE_HOME": os.devnull})
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
     assert done.stderr.startswith("error: no preset named 'huge'")
@@ -244,9 +244,7 @@ def test_a_real_process_says_one_line_too():
 
 
 @pytest.mark.parametrize("option", ["--picture", "--video"])
-def test_an_output_that_cannot_be_written_is_told_before_the_work(
-    option, tiny, tiny_run, tmp_path, monkeypatch, capsys
-):
+def test_unwritable_output_is_error_before_evaluation(option, tiny, tiny_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("ct_jax.pipeline.evaluate", lambda *_, **__: pytest.fail("it was evaluated"))
     ending = {"--picture": "png", "--video": "mp4"}[option]
     folder, file = tmp_path / f"folder.{ending}", tmp_path / "file"
@@ -260,14 +258,12 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(
 
 @pytest.mark.parametrize("as_json", [True, False])
 @pytest.mark.parametrize(("stop", "status"), [(OSError(28, "No space left"), 2), (KeyboardInterrupt(), 130)])
-def test_the_row_is_printed_before_anything_is_drawn(
-    as_json, stop, status, tiny, tiny_run, tmp_path, monkeypatch, capsys
-):
+def test_row_is_printed_before_drawing(as_json, stop, status, tiny, tiny_run, tmp_path, monkeypatch, capsys):
     def draw(*_):
         raise stop
 
     monkeypatch.setattr("ct_jax.report.pictures.write_paths", draw)
-    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--return_scale", "0.5"]
+    command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2", "--return-scale", "0.5"]
     assert main([*command, "--picture", str(tmp_path / "p.png"), *["--json"] * as_json]) == status
     out = capsys.readouterr().out
     if as_json:
@@ -276,7 +272,7 @@ def test_the_row_is_printed_before_anything_is_drawn(
         assert out.splitlines()[1].split()[:2] == ["antmaze-umaze", "ct"]
 
 
-def test_a_row_that_stdout_cannot_take_is_told_on_stderr(tiny, tiny_run, monkeypatch, capsys):
+def test_row_goes_to_stderr_if_stdout_fails(tiny, tiny_run, monkeypatch, capsys):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -286,8 +282,8 @@ def test_a_row_that_stdout_cannot_take_is_told_on_stderr(tiny, tiny_run, monkeyp
     assert json.loads(row)["episodes"] == 2 and error.startswith("error: No space left on device")
 
 
-def test_commands_leave_nothing_where_they_are_run(tiny_run, tmp_path):
-    """Not of MuJoCo either, which has a log for its warnings."""
+def test_commands_leave_no_files_in_working_folder(tiny_run, tmp_path):
+    """MuJoCo writes no log file either."""
     nowhere = tmp_path / "here"
     nowhere.mkdir()
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
@@ -313,7 +309,7 @@ def test_commands_leave_nothing_where_they_are_run(tiny_run, tmp_path):
         ({"JAX_ENABLE_X64": "maybe"}, ["'maybe'", "JAX_ENABLE_X64", "correct the variable"]),
     ],
 )
-def test_devices_that_do_not_start_are_told_in_one_line(variables, words):
+def test_failed_start_of_devices_is_error_of_one_line(variables, words):
     try:
         jax.devices(variables.get("JAX_PLATFORMS", "nothing"))
         pytest.skip("this machine has it")
@@ -324,7 +320,7 @@ def test_devices_that_do_not_start_are_told_in_one_line(variables, words):
     assert done.stderr.startswith("error: ") and [word for word in words if word not in done.stderr] == []
 
 
-def test_an_empty_choice_of_platform_is_jaxs(tmp_path):
+def test_empty_platform_variable_uses_default(tmp_path):
     code = "from ct_jax.cli import prepare_jax; prepare_jax(); import jax; print(len(jax.devices()) > 0)"
     assert shell("-c", code, env={"JAX_PLATFORMS": "", "XLA_FLAGS": ""}, cwd=tmp_path).stdout == "True\n"
 
@@ -347,7 +343,7 @@ def test_an_empty_choice_of_platform_is_jaxs(tmp_path):
     ids=["ragged", "empty", "blank", "all-wall", "unclosed", "letter", "not-utf8", "10000x10000"],
 )
 @pytest.mark.parametrize("command", ["train", "evaluate"])
-def test_bad_maze_files_are_named_with_line_and_mend(command, content, words, tiny, tiny_run, tmp_path, capsys):
+def test_bad_maze_file_is_error_with_line_and_remedy(command, content, words, tiny, tiny_run, tmp_path, capsys):
     file = tmp_path / "floor.txt"
     if isinstance(content, int):
         with file.open("wb") as opened:
@@ -360,11 +356,11 @@ def test_bad_maze_files_are_named_with_line_and_mend(command, content, words, ti
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_is_no_maze(tiny, tmp_path, capsys):
+def test_folder_as_maze_is_error(tiny, tmp_path, capsys):
     assert str(tmp_path) in refused(capsys, "train", "point", "--maze", tmp_path)
 
 
-def test_a_maze_that_cannot_be_read(tiny, tmp_path, monkeypatch, capsys):
+def test_unreadable_maze_is_error(tiny, tmp_path, monkeypatch, capsys):
     file = tmp_path / "floor.txt"
     file.write_text("###\n#.#\n###\n")
 
@@ -376,7 +372,7 @@ def test_a_maze_that_cannot_be_read(tiny, tmp_path, monkeypatch, capsys):
     assert str(file) in line and "Permission denied" in line
 
 
-def test_crlf_and_trailing_blank_lines_are_simply_read(tiny, tiny_run, islands, tmp_path, capsys):
+def test_crlf_and_trailing_blank_lines_are_accepted(tiny, tiny_run, islands, tmp_path, capsys):
     file = tmp_path / "floor.txt"
     file.write_bytes(islands.read_bytes().replace(b"\n", b"\r\n") + b"\r\n\r\n")
     rows = []
@@ -389,7 +385,7 @@ def test_crlf_and_trailing_blank_lines_are_simply_read(tiny, tiny_run, islands, 
 # ----------------------------------------------------------------------------------------------------- bad folders
 
 
-def test_out_must_be_a_folder_that_can_be_used(tiny, tmp_path, capsys):
+def test_out_must_be_usable_folder(tiny, tmp_path, capsys):
     command = ["train", "point", "--preset", "tiny", "--maze", "antmaze-umaze", "--out"]
     file, other = tmp_path / "file", tmp_path / "other"
     file.write_text("mine")
@@ -401,7 +397,7 @@ def test_out_must_be_a_folder_that_can_be_used(tiny, tmp_path, capsys):
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
 
 
-def test_a_run_is_not_begun_twice(tiny, tiny_run, capsys):
+def test_existing_run_needs_resume(tiny, tiny_run, capsys):
     out = ["--out", tiny_run.folder]
     assert "--resume" in refused(capsys, *tiny_run.arguments, *out)
     assert "seed 0, not 5" in refused(capsys, *tiny_run.arguments, *out, "--resume", "--seed", "5")
@@ -409,7 +405,7 @@ def test_a_run_is_not_begun_twice(tiny, tiny_run, capsys):
     assert "mazes islands, not hall" in refused(capsys, *other)
 
 
-def test_an_unfinished_run_has_no_model_yet(tiny, tiny_run, tmp_path, capsys):
+def test_unfinished_run_has_no_model(tiny, tiny_run, tmp_path, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     shutil.rmtree(folder / "model")
     line = refused(capsys, "evaluate", folder)
@@ -426,7 +422,7 @@ def test_an_unfinished_run_has_no_model_yet(tiny, tiny_run, tmp_path, capsys):
         (lambda text: text.replace('"layers"', '"lawyers"'), "another version"),
     ],
 )
-def test_a_damaged_model_is_named_with_the_mend(change, word, tiny, tiny_run, tmp_path, capsys):
+def test_damaged_model_is_error_with_remedy(change, word, tiny, tiny_run, tmp_path, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     file = folder / "model" / "model.json"
     file.write_text(change(file.read_text()))
@@ -434,7 +430,7 @@ def test_a_damaged_model_is_named_with_the_mend(change, word, tiny, tiny_run, tm
     assert str(file) in line and word in line and "delete" in line
 
 
-def test_a_full_disk_is_one_line_and_keeps_what_is_there(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+def test_full_disk_is_error_of_one_line_and_keeps_files(tiny, tiny_run, tmp_path, monkeypatch, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     (folder / "evaluate" / "done.json").unlink()
     (folder / "evaluate" / "islands-ct.json").unlink()
@@ -455,7 +451,7 @@ def test_a_full_disk_is_one_line_and_keeps_what_is_there(tiny, tiny_run, tmp_pat
 # ---------------------------------------------------------------------------------------------------- interruption
 
 
-def test_ctrl_c_is_130_and_a_line(monkeypatch, capsys):
+def test_ctrl_c_gives_status_130_and_one_line(monkeypatch, capsys):
     def stop(command):
         raise KeyboardInterrupt
 
@@ -468,7 +464,7 @@ def test_ctrl_c_is_130_and_a_line(monkeypatch, capsys):
     assert err.splitlines()[1].endswith("continue with: ct-jax train point --out 'runs/my run' --resume")
 
 
-def test_a_closed_pipe_is_no_error():
+def test_closed_pipe_is_not_an_error():
     code = "import sys; from ct_jax.cli import main; sys.exit(main(['mazes']))"
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     reader, writer = os.pipe()
@@ -484,8 +480,8 @@ def test_a_closed_pipe_is_no_error():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("--coordinator x:1", "go together"),
-        ("--processes 2 --process 0", "go together"),
+        ("--coordinator x:1", "belong together"),
+        ("--processes 2 --process 0", "belong together"),
         ("--coordinator x --processes 2 --process 0", "--coordinator x: give HOST:PORT"),
         ("--coordinator x:port --processes 2 --process 0", "--coordinator x:port: give HOST:PORT"),
         ("--coordinator x:1 --processes 2 --process 2", "--process 2: give a number from 0 to 1"),
@@ -493,7 +489,7 @@ def test_a_closed_pipe_is_no_error():
         ("--cluster --process 0", "leave out --coordinator"),
     ],
 )
-def test_a_process_that_does_not_know_itself_is_told_in_one_line(capsys, command, options, said):
+def test_incomplete_process_options_are_error_of_one_line(capsys, command, options, said):
     assert main([*command, *options.split()]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and said in error and error.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Everything compiles once: once in a process, and once for all the processes of a user."""
+"""Each program is compiled once per process, and once for all processes of a user."""
 
 import json
 import os
@@ -26,7 +26,7 @@ FOLDER = "jax_compilation_cache_dir"
 
 
 def count(arguments, settings, home, file):
-    """A command in a process of its own; writes down how many programs it asked for, and how many were there."""
+    """Run a command in a separate process, which records the number of programs and of cache hits."""
     from ct_envs import robots
     from ct_jax import cli, presets
 
@@ -48,8 +48,8 @@ def counts(fork, arguments, settings, tmp_path):
     return json.loads((tmp_path / "counts.json").read_text())
 
 
-def test_the_same_command_again_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
-    """Programs that step MuJoCo, too; and nobody else can get at them."""
+def test_second_evaluation_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
+    """This includes programs that step MuJoCo. Other users cannot access the cache."""
     command = ["evaluate", str(tiny_run.folder), "--maze", "antmaze-umaze", "--episodes", "2"]
     asked, there = counts(fork, command, tiny_settings, tmp_path)
     assert there < asked
@@ -60,7 +60,7 @@ def test_the_same_command_again_compiles_nothing(fork, tiny_run, tiny_settings, 
 
 
 @pytest.mark.long
-def test_the_same_training_again_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
+def test_second_training_compiles_nothing(fork, tiny_run, tiny_settings, tmp_path):
     asked = []
     for name in ("first", "second"):
         command = [*tiny_run.arguments, "--out", str(tmp_path / name)]
@@ -69,7 +69,7 @@ def test_the_same_training_again_compiles_nothing(fork, tiny_run, tiny_settings,
     assert first == second == there > 100
 
 
-def test_acting_compiles_once_for_mazes_of_a_size_and_a_horizon(tiny_run, islands):
+def test_acting_compiles_once_for_mazes_of_same_size(tiny_run, islands):
     """Of horizons each, too, whenever it comes again."""
     model, env = load_model(str(tiny_run.folder)), MazeEnv("point", engine="mujoco", auto_reset=False)
     before = run._cache_size()
@@ -88,7 +88,7 @@ def test_acting_compiles_once_for_mazes_of_a_size_and_a_horizon(tiny_run, island
 
 @pytest.fixture
 def kept(monkeypatch, tmp_path):
-    """Calls ``keep_programs`` with nothing configured; the folder that it chooses, and the home it should be in."""
+    """Call ``keep_programs`` without configuration; returns the chosen folder and the expected home folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
 
     def keep():
@@ -101,7 +101,7 @@ def kept(monkeypatch, tmp_path):
     return keep
 
 
-def test_the_folder_becomes_private(kept, tmp_path):
+def test_cache_folder_is_private(kept, tmp_path):
     home = tmp_path / "home" / "ct-jax"
     home.mkdir(parents=True, mode=0o777)
     home.chmod(0o777)
@@ -110,23 +110,23 @@ def test_the_folder_becomes_private(kept, tmp_path):
     assert stat.S_IMODE(home.stat().st_mode) == stat.S_IMODE(os.stat(folder).st_mode) == 0o700
 
 
-def test_a_folder_of_somebody_else_is_not_used(kept, monkeypatch):
+def test_cache_folder_of_other_user_is_not_used(kept, monkeypatch):
     monkeypatch.setattr(compilation.os, "getuid", lambda: os.geteuid() + 1)
     assert kept() is None
 
 
-def test_a_home_that_cannot_be_written_to_is_no_error(kept, monkeypatch):
+def test_unwritable_home_is_not_an_error(kept, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
     assert kept() is None
 
 
-def test_other_processors_have_other_folders(kept, monkeypatch):
+def test_each_kind_of_processor_has_its_own_cache(kept, monkeypatch):
     ours = kept()
     monkeypatch.setattr(compilation, "_processor", lambda: "another")
     assert kept() != ours
 
 
-def test_a_folder_that_was_named_stays():
+def test_configured_cache_folder_is_kept():
     before = jax.config.values[FOLDER]
     quickest = jax.config.jax_persistent_cache_min_compile_time_secs
     try:

@@ -1,4 +1,4 @@
-"""Dense layers and dropout: those of flax, in another order."""
+"""Dense layers and dropout: equal to those of flax, with another order of operations."""
 
 import flax.linen as nn
 import jax
@@ -11,7 +11,7 @@ from ct_jax.dense import Dense, Dropout
 
 @pytest.mark.parametrize("shape", [(3,), (5, 3), (4, 5, 3)])
 @pytest.mark.parametrize("features", [2, 7])
-def test_a_dense_layer_and_its_gradients_are_flaxs(shape, features):
+def test_dense_layer_and_gradients_equal_flax(shape, features):
     x = jax.random.normal(jax.random.key(0), shape)
     ours, flaxs = Dense(features), nn.Dense(features)
     params = jax.tree.map(lambda leaf: leaf + 0.5, ours.init(jax.random.key(1), x))
@@ -25,7 +25,7 @@ def test_a_dense_layer_and_its_gradients_are_flaxs(shape, features):
 
 
 @pytest.mark.parametrize("width", [16, 7])
-def test_dropout_keeps_its_share_and_the_mean(width):
+def test_dropout_keeps_rate_and_mean(width):
     rngs = {"dropout": jax.random.key(0)}
     dropped = np.asarray(Dropout(0.25).apply({}, jnp.ones((3000, width)), deterministic=False, rngs=rngs))
     kept = dropped > 0

@@ -1,4 +1,4 @@
-"""Several devices and several processes, for real: the same losses, checkpoints and episodes as on one device."""
+"""Several real devices and processes: the same losses, checkpoints and episodes as on one device."""
 
 import fcntl
 import os
@@ -29,7 +29,7 @@ def begin(*arguments: str, host_devices: int = 1) -> subprocess.Popen:
 
 
 def finish(*processes: subprocess.Popen, timeout_s: float = 300.0) -> None:
-    """Wait for all of them; none is left behind, whatever happens."""
+    """Wait for all processes, and end those that remain."""
     try:
         said = [process.communicate(timeout=timeout_s)[0] for process in processes]
     finally:
@@ -47,7 +47,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory, toy_data):
-    """What came of one device, of four in one process, and of two processes, by name; once for all test workers."""
+    """Results by name: one device, four devices in one process, and two processes. All test workers share them."""
     ours = tmp_path_factory.getbasetemp()
     folder = (ours.parent if "PYTEST_XDIST_WORKER" in os.environ else ours) / "devices"
     folder.mkdir(exist_ok=True)
@@ -62,32 +62,32 @@ def runs(tmp_path_factory, toy_data):
     return {name: dict(np.load(folder / f"{name}.npz")) for name in ("one", "four", "two")}
 
 
-def test_each_ran_on_its_number_of_devices(runs):
+def test_runs_use_their_number_of_devices(runs):
     assert [int(runs[name]["devices"]) for name in ("one", "four", "two")] == [1, 4, 2]
 
 
 @pytest.mark.parametrize("name", ["four", "two"])
-def test_the_loss_is_that_of_one_device(runs, name):
+def test_loss_equals_loss_of_one_device(runs, name):
     one, several = runs["one"]["losses"], runs[name]["losses"]
     assert len(one) == 20 and len(set(one)) == 20
     np.testing.assert_allclose(several, one, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["one", "four", "two"])
-def test_a_signal_to_one_process_stops_all_where_they_can_go_on(runs, name):
+def test_signal_to_one_process_stops_all_at_same_step(runs, name):
     np.testing.assert_allclose(runs[name]["half"], runs["one"]["losses"][:10], rtol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "saved"), [("one", "one"), ("four", "one"), ("two", "one"), ("two", "four")])
-def test_training_goes_on_from_any_number_of_devices(runs, name, saved):
+def test_training_resumes_on_any_number_of_devices(runs, name, saved):
     found = runs[name][f"from-{saved}"]
     assert len(found) == 10
     np.testing.assert_allclose(found, runs["one"]["losses"][10:], rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["four", "two"])
-def test_no_device_is_sent_more_of_the_data_than_their_lengths(runs, name):
-    """Of all that a device holds a share of, it is sent only the steps that were drawn."""
+def test_device_receives_only_sampled_steps(runs, name):
+    """A device receives only the sampled steps, not the trajectories."""
     sent, rows, table = (int(runs[name][what]) for what in ("sent", "rows", "table"))
     assert 0 < sent <= rows < table
 
@@ -99,13 +99,13 @@ def by_goal(run) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("name", ["four", "two"])
-def test_the_same_trajectories_are_collected(runs, name):
+def test_collected_trajectories_are_the_same(runs, name):
     for several, one in zip(by_goal(runs[name]), by_goal(runs["one"]), strict=True):
         np.testing.assert_allclose(several, one, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["four", "two"])
-def test_the_same_episodes_are_evaluated(runs, name):
+def test_evaluated_episodes_are_the_same(runs, name):
     parts = [part for part in runs["one"] if part.startswith("evaluated")]
     assert runs["one"]["evaluated-path"].shape == (20, 5, 2) and len(parts) == 6
     for part in parts:
@@ -116,13 +116,13 @@ def test_the_same_episodes_are_evaluated(runs, name):
 
 
 @pytest.mark.parametrize("n", [1, 5, 8])
-def test_filling_up_repeats_the_last(n):
+def test_padding_repeats_last_index(n):
     order = devices.fill_up(n, devices.data_mesh())
     assert len(order) % jax.device_count() == 0
     assert order[:n].tolist() == list(range(n)) and set(order[n:]) <= {n - 1}
 
 
-def test_what_several_processes_wrote_is_shared_evenly(tmp_path, toy_data, monkeypatch):
+def test_files_of_several_processes_are_divided_evenly(tmp_path, toy_data, monkeypatch):
     parts, file = [toy_data([3, 4], seed=1), toy_data([5, 6, 7], seed=2)], tmp_path / "data.npz"
     monkeypatch.setattr(devices, "joined", lambda rows: rows)
     monkeypatch.setattr(jax, "process_count", lambda: 2)
@@ -171,7 +171,7 @@ def listening(address: str) -> str:
     ("host", "expected"),
     [("localhost", LOOPBACK), ("127.0.0.1", LOOPBACK), ("[::1]", {"00000000000000000000000001000000"})],
 )
-def test_the_coordinator_listens_at_its_address_and_no_other(host, expected):
+def test_coordinator_listens_only_at_its_address(host, expected):
     if host == "[::1]" and not _has_ipv6():
         pytest.skip("no IPv6 here")
     (found,) = listening(f"{host}:{free_port()}").splitlines()
@@ -188,12 +188,12 @@ def _has_ipv6() -> bool:
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
-def test_an_address_of_another_machine_is_refused(host):
+def test_address_of_other_machine_is_error(host):
     with pytest.raises(UserError, match=rf"^--coordinator {host}:5: cannot listen there \(.*; give an address of"):
         devices.listening_address(f"{host}:5")
 
 
-def test_a_port_that_is_taken_is_refused():
+def test_port_in_use_is_error():
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -203,7 +203,7 @@ def test_a_port_that_is_taken_is_refused():
     assert devices.listening_address(address) == address
 
 
-def test_processes_that_cannot_share_a_batch_are_told(monkeypatch):
+def test_indivisible_batch_is_error(monkeypatch):
     class Device:
         def __init__(self, process: int):
             self.process_index, self.id = process, process

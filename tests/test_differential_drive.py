@@ -1,4 +1,4 @@
-"""The Turtlebot3's controller: it arrives from any pose, saturates, and is proportional below that."""
+"""The controller of the Turtlebot3: it reaches goals from any pose, saturates, and is proportional below saturation."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SEEDS = st.integers(0, 2**31 - 1)
 
 
 def move(position: np.ndarray, yaw: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where robots are that keep v and omega for a control step: on an arc."""
+    """The poses after a control step with constant v and omega, on an arc."""
     v, omega = speeds(action).T
     half = omega * DT_S / 2
     chord = v * DT_S * np.sinc(half / np.pi)
@@ -24,10 +24,10 @@ def move(position: np.ndarray, yaw: np.ndarray, action: np.ndarray) -> tuple[np.
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=3)
-def test_it_arrives_from_any_pose(controller, seed):
+def test_controller_reaches_goal_from_any_pose(controller, seed):
     rng = np.random.default_rng(seed)
     position, yaw = rng.uniform(-3, 3, (64, 2)), rng.uniform(-np.pi, np.pi, 64)
-    yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal right behind
+    yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal is behind the robot
     for _ in range(400):
         position, yaw = move(position, yaw, controller(to_heading(-position, yaw)))
     assert np.linalg.norm(position, axis=-1).max() < 0.05
@@ -36,7 +36,7 @@ def test_it_arrives_from_any_pose(controller, seed):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=20)
-def test_it_stays_within_the_limits_and_never_backs(controller, seed):
+def test_controller_respects_limits_and_never_reverses(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(50, 2)) * 10.0 ** np.arange(-4, 1).repeat(10)[:, None]
     v, omega = speeds(controller(goals)).T
     assert (v >= 0).all() and v.max() <= TOP_SPEED_MPS and np.abs(omega).max() <= TOP_TURN_RADPS
@@ -44,7 +44,7 @@ def test_it_stays_within_the_limits_and_never_backs(controller, seed):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_it_is_proportional_below_saturation(seed):
+def test_controller_is_proportional_below_saturation(seed):
     """The paper's equations, without slowing in turns."""
     rng = np.random.default_rng(seed)
     distance, angle = rng.uniform(0, 0.2, 20), rng.uniform(-0.9, 0.9, 20)
@@ -57,20 +57,20 @@ def test_it_is_proportional_below_saturation(seed):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @given(SEEDS)
 @settings(max_examples=20)
-def test_left_and_right_are_alike(controller, seed):
+def test_controller_is_mirror_symmetric(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(20, 2))
     np.testing.assert_allclose(controller(goals * [1, -1]), controller(goals) * [1, -1], atol=1e-12)
 
 
-def test_it_turns_before_it_drives():
+def test_controller_turns_before_driving():
     assert speeds(DifferentialDrive()(np.array([-1.0, 1.0]))).tolist() == [0.0, TOP_TURN_RADPS]
     assert DifferentialDrive()(np.zeros(2)).tolist() == [0.0, 0.0]
 
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_wheels_roll_as_the_robot_moves(seed):
-    """The mean of the wheels' ways is the robot's, their difference its turn times the separation."""
+def test_wheel_speeds_match_motion_of_robot(seed):
+    """The mean distance of the wheels is that of the robot; their difference is the turn times the wheel separation."""
     rng = np.random.default_rng(seed)
     v, omega = rng.uniform(-1, 1, (2, 30)) * [[TOP_SPEED_MPS], [TOP_TURN_RADPS]]
     left, right = 0.033 * wheel_speeds(v, omega).T

@@ -1,4 +1,4 @@
-"""What people read: links, anchors, pictures, commands, files and settings named in README.md and docs/ exist."""
+"""Documentation: links, anchors, pictures, commands, files and settings in README.md and docs/ exist."""
 
 import contextlib
 import dataclasses
@@ -53,7 +53,7 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_links(file: Path, text: str) -> list[str]:
-    """Relative links and pictures of a page that lead nowhere; and pictures on other hosts."""
+    """The broken relative links and pictures of a page, and pictures on other hosts."""
     broken = []
     for picture, target in LINK.findall(prose(text)):
         if re.match(r"[a-z]+:", target):
@@ -67,7 +67,7 @@ def broken_links(file: Path, text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("file", PAGES, ids=name_of)
-def test_every_link_and_picture_is_there(file):
+def test_links_and_pictures_exist(file):
     assert not broken_links(file, file.read_text("utf-8"))
 
 
@@ -82,20 +82,20 @@ def test_every_link_and_picture_is_there(file):
         ("```\n[a](nowhere.md)\n```\n", []),
     ],
 )
-def test_a_broken_link_is_found(text, found, tmp_path):
+def test_broken_link_is_found(text, found, tmp_path):
     (tmp_path / "README.md").write_text("# Title\n")
     page = tmp_path / "page.md"
     page.write_text(text)
     assert broken_links(page, text) == found
 
 
-def test_the_readme_is_short_and_its_moving_picture_small():
+def test_readme_is_short_and_its_animation_is_small():
     text = (ROOT / "README.md").read_bytes()
     assert text.count(b"\n") <= 250 and len(text) <= 15_000
     assert (ROOT / "docs" / "ant.gif").stat().st_size < 3_000_000
 
 
-def test_the_site_has_every_page():
+def test_site_has_all_pages():
     site = tomllib.loads((ROOT / "zensical.toml").read_text("utf-8"))["project"]
 
     def files(entries):
@@ -118,14 +118,14 @@ def lines_of_code(text: str) -> list[str]:
 
 
 def commands(start: str) -> list[str]:
-    """All commands in the pages that start so, but for those with a placeholder."""
+    """All commands in the pages with this start, without those that have a placeholder."""
     found = [line for file in PAGES for line in lines_of_code(file.read_text("utf-8"))]
     found = [line[line.index(start) :] for line in found if re.search(rf"(^|[ /]){re.escape(start)}", line)]
     return [each for each in dict.fromkeys(found) if not re.search(r"\.\.\.|COMMAND|ROBOT|FILE| \| ", each)]
 
 
 def parse(options: type, arguments: list[str]) -> object:
-    """What tyro makes of arguments; fails the test with tyro's words."""
+    """Parse arguments with tyro. An error of tyro fails the test."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -135,13 +135,13 @@ def parse(options: type, arguments: list[str]) -> object:
 
 
 @pytest.mark.parametrize("command", commands("ct-jax "))
-def test_every_ct_jax_command_parses(command):
+def test_ct_jax_commands_parse(command):
     _, name, *arguments = shlex.split(command)
     parse(COMMANDS[name], arguments)
 
 
-def test_every_experiment_command_parses():
-    """Those that made the results included: they must work for who wants to make them again."""
+def test_experiment_commands_parse():
+    """This includes the commands that made the results, because users may want to repeat them."""
     found = commands("python experiments/")
     assert len(found) > 100
     classes = {"point": study.MazeOptions, "ant": study.MazeOptions, "humanoid": study.MazeOptions}
@@ -152,7 +152,7 @@ def test_every_experiment_command_parses():
         options = (
             classes.get(module.__name__) or getattr(module, "RoomOptions", None) or getattr(module, "Options", None)
         )
-        if options is None:  # it has none
+        if options is None:
             assert not arguments
             continue
         chosen = parse(options, arguments)
@@ -160,7 +160,7 @@ def test_every_experiment_command_parses():
             study.choose(study.load_variants(module.__name__), chosen.preset, chosen.variants)
 
 
-def test_every_benchmark_and_make_target_is_there():
+def test_benchmarks_and_make_targets_exist():
     assert all((ROOT / shlex.split(command)[1]).is_file() for command in commands("python benchmarks/"))
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
     named = {shlex.split(command)[1] for command in commands("make ") if len(shlex.split(command)) > 1}
@@ -171,14 +171,14 @@ def test_every_benchmark_and_make_target_is_there():
 
 
 @pytest.mark.parametrize("file", PAGES, ids=name_of)
-def test_every_file_that_is_named_is_there(file):
+def test_named_files_exist(file):
     named = [span for span in spans(file.read_text("utf-8")) if re.fullmatch(r"[\w.-]+(/[\w*.-]+)+/?", span)]
     ours = [span for span in named if (ROOT / span.partition("/")[0]).is_dir() and not span.startswith("runs")]
     assert not [span for span in ours if not list(ROOT.glob(span.rstrip("/")))]
 
 
 @pytest.mark.parametrize("file", [*DOCS, ROOT / "CHANGELOG.md"], ids=name_of)
-def test_every_setting_that_is_named_exists(file):
+def test_named_settings_exist(file):
     groups = {
         name: type(value) for name, value in vars(Settings()).items() if dataclasses.is_dataclass(value)
     } | {"last_fit": type(Settings().fit), "round_fit": type(Settings().fit)}  # fmt: skip
@@ -192,7 +192,7 @@ def test_every_setting_that_is_named_exists(file):
 @pytest.mark.slow
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.parametrize("name", ["README.md", "docs/api.md"])
-def test_the_python_of_a_page_runs(name, capsys):
+def test_python_code_of_page_runs(name, capsys):
     blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / name).read_text("utf-8"), re.MULTILINE | re.DOTALL)
     assert blocks
     for block in blocks:
@@ -201,7 +201,7 @@ def test_the_python_of_a_page_runs(name, capsys):
     assert not said or 0.0 <= float(said[0]) <= 1.0
 
 
-def test_the_results_that_are_shown_are_those_that_are_kept():
+def test_all_results_files_are_shown():
     """Every results file has a page or a part of one."""
     shown = (ROOT / "experiments" / "pages.py").read_text("utf-8")
     for file in RESULTS.glob("*.json"):

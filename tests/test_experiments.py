@@ -1,4 +1,4 @@
-"""The experiments: what their variants are, that all rows are made once and kept, and that the pages show them."""
+"""The experiments: their variants, rows that are measured once and kept, and pages that show them."""
 
 import importlib
 import re
@@ -52,7 +52,7 @@ pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 
 def a_row(variant="cpu", seed=0, method="ct", success="01", **more) -> Row:
-    """A row of a model with these successes."""
+    """A row of a model with these outcomes."""
     head = {"variant": variant, "model_seed": seed, "method": method, "robot": "point", "maze": "m", "seen": True}
     head |= {"episodes": len(success), "seed": 0, "outcomes": {"success": success}}
     return Row.read(MADE | head | {"success_rate": success.count("1") / len(success)} | more)
@@ -67,8 +67,8 @@ def fits_of(settings):
 
 
 @pytest.mark.parametrize("robot", study.ROBOTS)
-def test_every_variant_is_a_preset_with_settings_that_exist(robot):
-    """And each fine-tuned one names the variant that it was before: the same data, without rounds."""
+def test_variants_override_existing_settings(robot):
+    """Each fine-tuned variant names its variant before fine-tuning, which has the same data and no rounds."""
     variants = load_variants(robot)
     assert variants[sys.modules[robot].SHIPPED].preset == "cpu"
     for name, variant in variants.items():
@@ -78,23 +78,23 @@ def test_every_variant_is_a_preset_with_settings_that_exist(robot):
             before = variants[variant.tuned_from].settings(robot)
             assert settings.rounds > 0 == before.rounds, name
             assert variant.preset == variants[variant.tuned_from].preset, name
-            if settings.rooms == before.rooms:  # "dense" has other rooms
+            if settings.rooms == before.rooms:  # the rooms of "dense" differ
                 assert settings.collect == before.collect, name
 
 
-def test_a_setting_that_does_not_exist_is_an_error():
+def test_override_of_unknown_setting_is_error():
     for changes in ({"model.nodes": 4}, {"models": 4}, {"rounds.fit": 4}):
         with pytest.raises((TypeError, AttributeError)):
             Variant("cpu", changes).settings("point")
 
 
 @pytest.mark.parametrize("robot", MAZE_ROBOTS)
-def test_the_methods_of_the_table(robot):
+def test_variants_match_methods_of_table(robot):
     known = load_variants(robot)
     assert list(known)[:7] == ["published", "bc", "f-ct", "pt-cql", "sac", "cpu-ct", "cpu"]
     assert [name for name, variant in known.items() if variant.baseline] == ["pt-cql", "sac"]
     variants = {name: variant.settings(robot) for name, variant in known.items()}
-    for name in ("roam", "modes+roam", "modes+memory+roam"):  # CT of the one maze, failures of many
+    for name in ("roam", "modes+roam", "modes+memory+roam"):  # trajectories from one maze, recoveries from many
         tuned, ct = variants[name], variants[known[name].tuned_from or ""]
         assert tuned.recover.random_mazes > 0 == tuned.random_mazes == ct.random_mazes and tuned.collect == ct.collect
     assert all(variants[name] == variants["published"] for name in ("pt-cql", "sac"))  # the same data
@@ -110,7 +110,7 @@ def test_the_methods_of_the_table(robot):
     assert lifted.last_fit is not None and lifted_ct.fit == replace(lifted.last_fit, shift_timestep=300)
     of_many_ct, of_many = (variants[name] for name in ("mazes-ct", "mazes"))
     assert of_many_ct.random_mazes == of_many.random_mazes > 0
-    assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # neither learns longer
+    assert of_many_ct.fit.updates == sum(fit.updates for fit in fits_of(of_many))  # the same number of updates
     for name, one in (("modes-ct", lifted_ct), ("modes", lifted)):  # nothing else differs
         assert replace(variants[name], model=one.model) == one and variants[name].model.modes > 1
     for name, one in (("skill-ct", lifted_ct), ("skill", lifted)):
@@ -126,10 +126,10 @@ def test_the_methods_of_the_table(robot):
     assert variants["modes"].model.commitment > variants["modes-ct"].model.commitment == 0.0
     sac = known["sac"].baseline
     assert isinstance(sac, SacConfig) and sac.iterations >= 4 * get_robot(robot).horizon
-    SacAlone(MazeEnv(robot, engine="mujoco"), replace(sac, replay=2000))  # its settings are for it
+    SacAlone(MazeEnv(robot, engine="mujoco"), replace(sac, replay=2000))  # the settings are valid for it
 
 
-def test_variants_can_be_chosen_and_unknown_ones_are_refused():
+def test_unknown_variant_is_error():
     known = load_variants("ant")
     assert list(choose(known, "cpu", ("cpu",))) == ["cpu"]
     assert list(choose(known, "cpu", ("cpu", "sac"))) == ["sac", "cpu"]
@@ -141,7 +141,7 @@ def test_variants_can_be_chosen_and_unknown_ones_are_refused():
         load_variants("cat")
 
 
-def test_every_size_has_every_method_of_the_paper():
+def test_all_presets_have_all_methods_of_paper():
     paper = choose(load_variants("ant"), "paper")
     assert list(paper) == ["published", "bc", "f-ct", "pt-cql", "sac"]
     of_size = [variant.settings("ant", "paper") for variant in paper.values()]
@@ -151,7 +151,7 @@ def test_every_size_has_every_method_of_the_paper():
     assert list(choose(load_variants("turtlebot3"), "published")) == ["ct", "bc-ct", "f-ct"]
 
 
-def test_the_turtlebots_rows_share_what_they_can():
+def test_turtlebot3_variants_share_stages():
     variants = {name: variant.settings("turtlebot3") for name, variant in load_variants("turtlebot3").items()}
     assert list(variants)[:4] == ["ct", "bc-ct", "f-ct", "cpu-ct"]
     assert list(variants)[4:] == ["cpu-ct-v", "cpu-ct-actions", "cpu", "noise-ct", "noise", "dense"]
@@ -174,17 +174,17 @@ def test_the_turtlebots_rows_share_what_they_can():
 
 @pytest.fixture
 def tiny_study(tiny_settings, tmp_path, monkeypatch):
-    """A study whose presets are all the tiny one."""
+    """A study in which all presets are the tiny one."""
     monkeypatch.setattr(study, "get_preset", lambda name, robot: tiny_settings)
     return Study(robot="point", preset="tiny", out=tmp_path)
 
 
 def ignore(found: Results) -> None:
-    """Keeps nothing."""
+    """Ignore the results."""
 
 
-def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tiny_study, monkeypatch):
-    """A finished run is taken as it is, the baselines are learned from its data, and nothing is done twice."""
+def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_study, monkeypatch):
+    """A finished run is not repeated, and the baselines are trained on its data."""
     shutil.copytree(tiny_run.folder, tiny_study.out / "one-0")
     mazes = ((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],), ("antmaze-umaze",))
     monkeypatch.setattr(study, "default_mazes", lambda robot: mazes)
@@ -198,7 +198,7 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
     assert [row.variant for row in rows] == [*["one"] * 6, *["pt-cql"] * 2, *["sac"] * 2]
     assert all(row.episodes == 4 and row.seed == 0 for row in rows)
     assert all(0 < (row.learn_wall_s or 0) <= row.run_wall_s for row in rows if row.method in ("pt-cql", "sac"))
-    assert all(set(row.more) >= {"success_ci95", "return_mean"} for row in rows)  # and all else that was measured
+    assert all(set(row.more) >= {"success_ci95", "return_mean"} for row in rows)  # and all other measurements
     monkeypatch.setattr(study, "train_cql", None)
     assert tiny_study.run(variants, (0,), ignore).rows == rows
     variants["pt-cql"] = Variant("tiny", baseline=replace(cql, updates=3))
@@ -206,8 +206,8 @@ def test_every_row_is_made_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
         tiny_study.run(variants, (0,), ignore)
 
 
-def test_sac_alone_needs_nothing_of_the_method(tiny_settings, tiny_study, monkeypatch):
-    """No controller, no trajectories: its run holds a policy and its rows."""
+def test_sac_alone_needs_no_controller_and_no_data(tiny_settings, tiny_study, monkeypatch):
+    """Its run contains only a policy and rows: no controller and no trajectories."""
     monkeypatch.setattr(study, "default_mazes", lambda robot: (("antmaze-umaze",), ()))
     sac = replace(tiny_settings.sac, iterations=4, warmup=1)
     (row,) = tiny_study.run({"sac": Variant("tiny", baseline=sac)}, (0,), ignore).rows
@@ -215,8 +215,8 @@ def test_sac_alone_needs_nothing_of_the_method(tiny_settings, tiny_study, monkey
     assert not any((tiny_study.out / "sac-0" / stage).exists() for stage in study.STAGES)
 
 
-def test_references_appear_once_for_each_margin(tiny_settings, tiny_study, monkeypatch):
-    """A planner that keeps away from walls is another one: it stands beside what it taught."""
+def test_references_have_one_row_per_margin(tiny_settings, tiny_study, monkeypatch):
+    """A planner with another margin is another reference, and has its own row."""
     margin = tiny_settings.prm.margin_m
     variants = {
         "one": Variant("tiny"), "two": Variant("tiny", {"rounds": 2}), "wary": Variant("tiny", {"prm.margin_m": 0.3}),
@@ -237,7 +237,7 @@ def test_references_appear_once_for_each_margin(tiny_settings, tiny_study, monke
     assert len(rows) == 2 * 3 + 2
 
 
-def test_a_run_that_cannot_be_finished_stops_no_other(tiny_study, monkeypatch):
+def test_failed_run_does_not_stop_others(tiny_study, monkeypatch):
     def measure(run, name, variant):
         if name == "one":
             raise UserError("full disk")
@@ -251,8 +251,8 @@ def test_a_run_that_cannot_be_finished_stops_no_other(tiny_study, monkeypatch):
     assert [row.variant for row in kept[-1].rows] == ["two"] and not kept[-1].unmade
 
 
-def test_f_ct_that_finds_nothing_to_learn_from_is_a_result(tiny_study, tmp_path, monkeypatch):
-    """The others go on; the reason stands in the results until there is a row, and on the page."""
+def test_missing_recoveries_are_recorded_as_result(tiny_study, tmp_path, monkeypatch):
+    """The other runs continue. The reason is in the results and on the page until the row exists."""
 
     def measure(run, name, variant):
         if name == "f-ct":
@@ -276,7 +276,7 @@ def test_f_ct_that_finds_nothing_to_learn_from_is_a_result(tiny_study, tmp_path,
     assert Results.read(file).unmade == [] and reasons([], known) == []
 
 
-def test_stages_whose_inputs_are_the_same_are_shared(tiny_run, tiny_settings, tmp_path):
+def test_stages_with_same_inputs_are_shared(tiny_run, tiny_settings, tmp_path):
     def run(name, **changes):
         maze = load_mazes((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],))
         unseen = load_mazes(("antmaze-umaze",))
@@ -299,12 +299,12 @@ def test_stages_whose_inputs_are_the_same_are_shared(tiny_run, tiny_settings, tm
         assert stages == list(study.STAGES)[: taken[name]], name
         rows = {file.stem.rpartition("-")[2] for file in (other.folder / "evaluate").glob("*.json")}
         assert rows == ({"planner", "explorer"} if taken[name] else set()), name
-        assert share([source], other) is None  # and again changes nothing
+        assert share([source], other) is None  # a second call changes nothing
     ours = stage_digests(source)
     assert len({*ours.values()}) == len(ours) and stage_digests(source) == ours
 
 
-def test_settings_have_digests():
+def test_digest_depends_on_settings():
     settings = get_preset("cpu")
     assert digest(settings) == digest(get_preset("cpu")) != digest(replace(settings, rounds=1))
     assert digest(settings, CqlConfig()) != digest(settings)
@@ -322,12 +322,12 @@ def test_reading_and_writing_results_is_the_identity(file, tmp_path):
     assert found.rows and all(row.more for row in found.rows)
 
 
-def test_a_file_that_holds_something_else_is_bad_input():
+def test_invalid_row_is_error():
     with pytest.raises(UserError, match=r"not a row of results .*'variant'.*; measure it again"):
         Row.read(MADE | {"method": "ct"})
 
 
-def test_rows_of_other_commands_stay_in_the_results(tmp_path):
+def test_rows_of_other_commands_are_kept(tmp_path):
     file = tmp_path / "new" / "results.json"
     planner = a_row("ct", 0, "planner", "11")
     add_results(file, Results(rows=[a_row("ct", 0), planner], noise=[a_row("ct", 0)]))
@@ -338,14 +338,14 @@ def test_rows_of_other_commands_stay_in_the_results(tmp_path):
         ("ct", 1, "ct", 0.5), ("bc", 0, "ct", 0.5), ("bc", 0, "planner", 0.5), ("ct", 0, "ct", 1.0),
     ]  # fmt: skip
     assert found.noise == [a_row("ct", 0)]
-    again = a_row("bc", 0, "planner", "01", margin_m=0.0)  # early rows do not name the margin that they had not
+    again = a_row("bc", 0, "planner", "01", margin_m=0.0)  # early rows have no margin
     wary = a_row("cpu", 0, "planner", "11", margin_m=0.3)
     add_results(file, Results(rows=[again, wary]))
     assert [row for row in Results.read(file).rows if row.method == "planner"] == [again, wary]
 
 
-def test_rows_of_other_settings_do_not_stay_under_the_same_name(tmp_path, capsys):
-    """A variant that was changed is measured again, all of it: no table joins what was trained in two ways."""
+def test_rows_with_old_settings_are_dropped(tmp_path, capsys):
+    """All rows of a changed variant are dropped, so that no table mixes old and new settings."""
     file = tmp_path / "results.json"
     old = [a_row("cpu", seed, settings="old") for seed in (0, 1)]
     stays = [a_row("cpu", 0, "planner", settings="old"), a_row("ct", 0, settings="ct's")]
@@ -356,7 +356,7 @@ def test_rows_of_other_settings_do_not_stay_under_the_same_name(tmp_path, capsys
     assert "dropped cpu, seed 1: its settings have changed" in capsys.readouterr().err
 
 
-def test_rows_that_agree_in_the_given_names_are_replaced(tmp_path):
+def test_rows_with_same_key_are_replaced(tmp_path):
     file = tmp_path / "new" / "finetuned.json"
     replace_rows(file, [a_row("cpu", 0), a_row("cpu", 1)], ("variant", "model_seed"), Row)
     again = a_row("cpu", 0, success="11")
@@ -366,7 +366,7 @@ def test_rows_that_agree_in_the_given_names_are_replaced(tmp_path):
 # ---------------------------------------------------------------------------------------------------------- tables
 
 
-def test_what_fine_tuning_adds_is_told_pair_by_pair():
+def test_gain_of_fine_tuning_is_computed_per_pair():
     half, known = "01" * 50, load_variants("point")
     before = [a_row("published", 0, success=half), a_row("published", 1, success=half)]
     after = [a_row("f-ct", 1, success="1" * 100), a_row("f-ct", 0, success=half)]
@@ -376,11 +376,11 @@ def test_what_fine_tuning_adds_is_told_pair_by_pair():
     assert differences(Results(rows=before + other), known) == []
     assert interval_of_mean(np.zeros((3, 100))) == (0.0, 0.0)
     low, high = interval_of_mean(np.tile([0.0, 1.0], (3, 50)))
-    assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # as a binomial's, were models alike
+    assert 0.38 < low < 0.42 and 0.58 < high < 0.62  # a binomial interval if the models were equal
 
 
-def test_models_that_differ_are_less_certain_than_episodes_are_many():
-    """Rates of 88, 84 and 78 of 100 are not known to two of 100; three that agree are, and one is as Wilson says."""
+def test_interval_is_wider_if_models_differ():
+    """The interval is wide for rates of 88, 84 and 78 %, and a Wilson interval for equal models or one model."""
 
     def width(*rates):
         rows = [a_row(success="1" * round(500 * rate) + "0" * round(500 * (1 - rate))) for rate in rates]
@@ -388,10 +388,10 @@ def test_models_that_differ_are_less_certain_than_episodes_are_many():
         return int(high) - int(low)
 
     assert width(0.884, 0.836, 0.78) >= 8
-    assert width(0.836) in (6, 7) and width(0.836, 0.836, 0.836) in (6, 7)  # the same pairs three times
+    assert width(0.836) in (6, 7) and width(0.836, 0.836, 0.836) in (6, 7)  # three models with the same outcomes
 
 
-def test_a_maze_table_has_the_variants_in_order_and_the_references_last():
+def test_maze_table_has_variants_in_order_and_references_last():
     rows = [a_row("", 0, "planner"), a_row("cpu", 1, success="1110"), a_row("cpu", 0, success="1100")]
     rows += [a_row("published"), a_row("of-yesterday")]
     lines = maze_tables(Results(rows=rows), load_variants("point"))
@@ -402,17 +402,17 @@ def test_a_maze_table_has_the_variants_in_order_and_the_references_last():
     assert lines[5].split(" | ")[2] == "50, 75" and lines[6].split(" | ")[2] == ""
 
 
-def test_the_page_says_what_made_each_row():
+def test_page_shows_origin_of_rows():
     rows = [a_row("cpu", 1, run_wall_s=600.0, collect_wall_s=60.0), a_row("cpu", 0, run_wall_s=1200.0)]
     rows += [a_row("cpu", 2, commit="def", run_wall_s=60.0), a_row("cpu", 0, "planner")]
     assert runs_table(rows, load_variants("point"))[2:] == [
-        "| `cpu` | 0, 1 | 15, of them 1.0 to collect | `python x.py` | abc | CPU | 2026-01-01 |",
+        "| `cpu` | 0, 1 | 15 (1.0 for collection) | `python x.py` | abc | CPU | 2026-01-01 |",
         "| `cpu` | 2 | 1 | `python x.py` | def | CPU | 2026-01-01 |",
         "| planner, explorer |  |  | `python x.py` | abc | CPU | 2026-01-01 |",
     ]
 
 
-def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
+def test_turtlebot3_table_joins_models():
     def row(seed, density, success, **more):
         rates = {"success_rate": success, "frontal_rate": 0.0, "grazing_rate": 0.1, "spl": 0.5, "episodes": 500}
         where = {"density": density, "noise": 0.0, "worlds": 20, "pairs": 25}
@@ -427,7 +427,7 @@ def test_the_turtlebots_table_joins_models_and_counts_no_row_twice():
     assert found[2][2:] == ["60", "5", "5 |"] and len(found) == 3
 
 
-def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart():
+def test_gain_table_has_one_line_per_f_ct_and_ct():
     def row(variant, seed, successes):
         return a_row(variant, seed, success=successes, controller="one")
 
@@ -443,21 +443,21 @@ def test_what_fine_tuning_adds_is_counted_pair_by_pair_and_for_each_f_ct_apart()
     ]
     assert [line[-1].split()[0] for line in lines] == ["+12.5", "+100.0"]
     assert table(*one, *many)[1] == lines[0]  # in any order
-    roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # of whose CT, cpu-ct, there is no seed 1
+    roaming = [row("roam", 0, "1101"), row("roam", 1, "1111")]  # its CT, cpu-ct, has no seed 1
     (line,) = (line for line in table(*one, *roaming) if line[1] == "`roam`")
     assert line[4] == "1" and line[-1].startswith("+75.0")
     (line,) = (line for line in table(*one, *roaming, row("long-ct", 1, "0111")) if line[2] == "`long-ct`")
     assert line[1] == "`roam`" and line[4] == "1" and line[-1].startswith("+25.0")
 
 
-def test_only_fine_tuned_variants_are_compared_with_what_they_were():
+def test_only_fine_tuned_variants_are_compared():
     assert finetuned.before_of(finetuned.Options(robot="ant", tuned="skill")) == "skill-ct"
     assert finetuned.before_of(finetuned.Options(tuned="roam", longer=True)) == "long-ct"
-    with pytest.raises(UserError, match="--tuned cpu-ct: no fine-tuned variant; give one of f-ct, cpu, mazes"):
+    with pytest.raises(UserError, match="--tuned cpu-ct: not a fine-tuned variant; give one of f-ct, cpu, mazes"):
         finetuned.before_of(finetuned.Options(tuned="cpu-ct"))
 
 
-def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
+def test_transfer_table_interpolates_updates():
     curves = {("scratch", 0): (0.0, 0.2, 0.8), ("scratch", 1): (0.0, 0.4, 1.0), ("ant", 0): (0.5, 0.85, 0.9)}
     head = MADE | {"robot": "point", "run": "cpu-0", "maze": "m", "episodes": 100}
     rows = [
@@ -469,12 +469,12 @@ def test_the_table_of_transfer_says_when_most_of_the_final_success_was_there():
         for mark, rate in zip((25, 50, 100), curve, strict=True)
     ]  # fmt: skip
     lines = transfer_table(rows)
-    # 51 of 60 points of the way from 50 to 100
+    # 51 of 60 percentage points between 50 and 100 updates
     assert lines[2] == "| point | `cpu-0` | from scratch | 2 | 0 | 30 | 90 | 90 |"
     assert lines[3] == "| point | `cpu-0` | from the trunk of the ant's cpu-0 | 1 | 50 | 85 | 90 | 46 |"
 
 
-def test_a_shipped_controller_says_how_it_was_learned(tiny_run):
+def test_shipped_controller_has_learning_curve(tiny_run):
     found = described(tiny_run.folder)
     curve, config = found["made"]["curve"], found["sac"]
     assert curve and curve[-1] == (config["iterations"], found["made"]["held_out_success"])
@@ -483,7 +483,7 @@ def test_a_shipped_controller_says_how_it_was_learned(tiny_run):
     assert f"| {100 * curve[-1][1]:.1f} |" in line and found["made"]["command"] in line
 
 
-def test_the_summary_is_of_all_models_and_of_the_planner_that_led_them():
+def test_summary_covers_all_models_and_their_planner():
     def row(variant, seed, success, method="ct"):
         flags = "1" * round(100 * success) + "0" * round(100 * (1 - success))
         return a_row(variant, seed, method, flags, maze="antmaze-large")
@@ -502,7 +502,7 @@ def test_the_summary_is_of_all_models_and_of_the_planner_that_led_them():
 # ----------------------------------------------------------------------------------------------------------- pages
 
 
-def test_a_table_is_put_between_its_markers_and_nowhere_else():
+def test_table_is_put_between_its_markers_only():
     text = "a\n<!-- x -->\nold\n<!-- /x -->\n<!-- xy -->\nb\n<!-- /xy -->\n"
     assert put(text, "x", ["new"]) == text.replace("old", "new")
     assert put(put(text, "x", ["1"]), "x", ["old"]) == text
@@ -513,26 +513,26 @@ def written():
     return pages.pages()
 
 
-def test_the_pages_show_what_was_measured(written):
-    """README's summary, docs/results, docs/speed.md and the model cards are what the result files give."""
+def test_pages_match_results_files(written):
+    """README's summary, docs/results, docs/speed.md and the model cards are up to date."""
     stale = [str(file.relative_to(pages.ROOT)) for file, text in written.items() if file.read_text("utf-8") != text]
     assert not stale, "run: python experiments/pages.py"
     assert {file.name for file in pages.PAGES.glob("*.md")} == {f.name for f in written if f.parent == pages.PAGES}
 
 
-def test_every_plot_is_there():
+def test_all_plots_exist():
     assert all(file.is_file() for file in pages.plots())
 
 
-def test_every_row_stands_on_a_page_with_what_made_it(written):
-    """No result is left out, and none is without its command and commit."""
+def test_all_rows_are_on_pages_with_origin(written):
+    """No result is left out, and all have their command and commit."""
     for name, found in pages.load_results().items():
         text = written[pages.PAGES / f"{name.partition('-')[0]}.md"]
         for row in [row for kind in LISTS for row in getattr(found, kind)] + found.unmade:
             assert f"`{row.command}` | {row.commit} | {row.hardware} | {row.created[:10]}" in text
 
 
-def test_every_marker_has_its_pair():
+def test_markers_come_in_pairs():
     for file in [pages.ROOT / "README.md", *pages.DOCS.rglob("*.md")]:
         opened = re.findall(r"^<!-- ([\w-]+) -->$", file.read_text("utf-8"), re.MULTILINE)
         closed = re.findall(r"^<!-- /([\w-]+) -->$", file.read_text("utf-8"), re.MULTILINE)
@@ -540,7 +540,7 @@ def test_every_marker_has_its_pair():
 
 
 @pytest.mark.parametrize("name", ["cql", "finetuned", "transfer"])
-def test_a_results_file_that_cannot_be_written_is_told_before_the_work(name, tmp_path, monkeypatch):
+def test_unwritable_results_file_is_error_before_work(name, tmp_path, monkeypatch):
     script = importlib.import_module(name)
     (tmp_path / "file").write_text("mine")
     monkeypatch.setattr(script, "prepare_jax", lambda: pytest.fail("it began"))
@@ -551,7 +551,7 @@ def test_a_results_file_that_cannot_be_written_is_told_before_the_work(name, tmp
 
 
 @pytest.mark.parametrize("name", ["point", "turtlebot3"])
-def test_a_study_whose_results_cannot_be_written_is_told_before_the_work(name, tmp_path, monkeypatch, capsys):
+def test_unwritable_results_of_study_are_error_before_work(name, tmp_path, monkeypatch, capsys):
     script = importlib.import_module(name)
     (tmp_path / f"{name}-cpu.json").mkdir()
     monkeypatch.setattr(Study, "run", lambda *_: pytest.fail("it began"))

@@ -1,4 +1,4 @@
-"""What is written: whole or not at all, where it was asked for, for everyone whom the umask lets read it."""
+"""Writing files: complete or not at all, not through links, and with the permissions of the umask."""
 
 import functools
 import os
@@ -19,13 +19,12 @@ from ct_jax.cli import main
 from ct_jax.files import append_to, check_writable, drop_parts, make_folder, save_arrays, whole, write_text
 from ct_jax.progress import Metrics
 
-CONTENT = np.random.default_rng(0).random(20_000)  # that no compression makes small
+CONTENT = np.random.default_rng(0).random(20_000)  # it cannot be compressed
 
 
 @contextmanager
 def no_room(most: int = 1000):
-    """No file may become larger than this: what the system then says is what it says of a full disk, but for the
-    number."""
+    """A limit of the file size, which stands for a full disk. The system's error differs only in its number."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
     try:
@@ -63,7 +62,7 @@ WRITERS = {
 
 @pytest.fixture(params=WRITERS)
 def writer(request, tmp_path):
-    """A file in a folder of its own, and what writes it."""
+    """A file in its own folder, and a function that writes it."""
     (tmp_path / "inside").mkdir()
     return tmp_path / "inside" / request.param, functools.partial(WRITERS[request.param])
 
@@ -72,14 +71,14 @@ def writer(request, tmp_path):
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o002, 0o077])
-def test_who_may_read_a_file_is_the_umasks_to_say(writer, mask):
+def test_umask_sets_permissions(writer, mask):
     file, write = writer
     with umask(mask):
         write(file)
     assert file.stat().st_mode & 0o777 == 0o666 & ~mask
 
 
-def test_a_write_that_fails_changes_nothing_and_leaves_nothing(writer):
+def test_failed_write_changes_nothing(writer):
     file, write = writer
     for before in ([], [file]):
         with no_room(), pytest.raises(UserError, match=rf"^{file}: cannot be written \(.*; what is finished is kept$"):
@@ -89,7 +88,7 @@ def test_a_write_that_fails_changes_nothing_and_leaves_nothing(writer):
     assert file.read_bytes() == b"before"
 
 
-def test_a_link_is_replaced_and_what_it_points_to_stays(writer):
+def test_link_is_replaced_and_its_target_is_kept(writer):
     file, write = writer
     for victim in (file.parents[1] / "victim", file.parents[1] / "none"):
         if victim.name == "victim":
@@ -102,7 +101,7 @@ def test_a_link_is_replaced_and_what_it_points_to_stays(writer):
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, RuntimeError])
-def test_what_stops_a_writer_is_as_if_it_had_not_begun(tmp_path, stop):
+def test_interrupted_write_changes_nothing(tmp_path, stop):
     file = tmp_path / "file"
     file.write_text("before")
     with pytest.raises(stop), whole(file) as opened:
@@ -111,7 +110,7 @@ def test_what_stops_a_writer_is_as_if_it_had_not_begun(tmp_path, stop):
     assert file.read_text() == "before" and list(tmp_path.iterdir()) == [file]
 
 
-def test_what_a_killed_process_left_is_dropped_and_nothing_else(tmp_path):
+def test_only_unfinished_files_are_deleted(tmp_path):
     (tmp_path / "stage").mkdir()
     kept = tmp_path / "stage" / "lamp.part"
     kept.write_text("mine")
@@ -125,7 +124,7 @@ def test_what_a_killed_process_left_is_dropped_and_nothing_else(tmp_path):
 
 
 @pytest.mark.parametrize("open_it", [append_to, lambda file: make_folder(file)])
-def test_what_is_added_to_is_no_link(tmp_path, open_it):
+def test_append_to_link_is_error(tmp_path, open_it):
     victim = tmp_path / "victim"
     link = tmp_path / "link"
     link.symlink_to(victim)
@@ -144,7 +143,7 @@ def test_what_is_added_to_is_no_link(tmp_path, open_it):
         ("file/below", "cannot be written .Not a directory.*; give a folder that exists"),
     ],
 )
-def test_what_could_not_be_written_is_told_before(tmp_path, name, said):
+def test_unwritable_file_is_error_before_work(tmp_path, name, said):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UserError, match=rf"^--picture {tmp_path / name}: {said}"):
@@ -152,7 +151,7 @@ def test_what_could_not_be_written_is_told_before(tmp_path, name, said):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
-def test_a_trial_changes_nothing(tmp_path):
+def test_check_writable_changes_nothing(tmp_path):
     file = tmp_path / "file"
     for content in (None, "mine"):
         if content:
@@ -167,7 +166,7 @@ def test_a_trial_changes_nothing(tmp_path):
 # --------------------------------------------------------------------------------------------------- a run
 
 
-def test_everybody_may_read_a_checkpoint_and_a_log_if_the_umask_lets_them(tmp_path, toy_data):
+def test_umask_sets_permissions_of_checkpoints_and_logs(tmp_path, toy_data):
     with umask(0o027):
         checkpoints, metrics = Checkpoints(tmp_path / "checkpoints"), Metrics(tmp_path)
         checkpoints.save(1, {"a": np.ones(3)})
@@ -180,7 +179,7 @@ def test_everybody_may_read_a_checkpoint_and_a_log_if_the_umask_lets_them(tmp_pa
 
 
 @pytest.mark.rank_promotion("allow")
-def test_the_files_of_a_run_are_alike_and_no_part_is_left(tiny_run):
+def test_files_of_run_have_same_permissions(tiny_run):
     mask = os.umask(0)
     os.umask(mask)
     files = [path for path in tiny_run.folder.rglob("*") if path.is_file()]
@@ -190,8 +189,8 @@ def test_the_files_of_a_run_are_alike_and_no_part_is_left(tiny_run):
 
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.slow
-def test_no_link_in_its_folder_leads_a_run_outside(tiny, tiny_run, tmp_path):
-    """Links lie where the run is about to write each of its files."""
+def test_links_in_run_folder_are_not_followed(tiny, tiny_run, tmp_path):
+    """There is a link in the place of each file that the run will write."""
     folder, outside = tmp_path / "run", tmp_path / "outside"
     outside.mkdir()
     appended = {"config.json", "metrics.jsonl", "run.lock"}
@@ -209,7 +208,7 @@ def test_no_link_in_its_folder_leads_a_run_outside(tiny, tiny_run, tmp_path):
 
 @pytest.mark.rank_promotion("allow")
 @pytest.mark.parametrize("name", ["metrics.jsonl", "run.lock", "evaluate", "tensorboard", "model"])
-def test_a_run_with_a_link_that_it_cannot_replace_is_refused(name, tiny, tiny_run, tmp_path, capsys):
+def test_link_to_folder_in_run_is_error(name, tiny, tiny_run, tmp_path, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     victim = (folder / name).rename(tmp_path / "victim")
     (folder / name).symlink_to(victim)
@@ -222,7 +221,7 @@ def test_a_run_with_a_link_that_it_cannot_replace_is_refused(name, tiny, tiny_ru
 
 
 @pytest.mark.rank_promotion("allow")
-def test_a_report_does_not_follow_links(tiny_run, tmp_path, capsys):
+def test_report_does_not_follow_links(tiny_run, tmp_path, capsys):
     folder, victim = shutil.copytree(tiny_run.folder, tmp_path / "run"), tmp_path / "victim"
     victim.write_text("mine")
     for name in ("report.html", "report.png"):
@@ -233,7 +232,7 @@ def test_a_report_does_not_follow_links(tiny_run, tmp_path, capsys):
 
 
 @pytest.mark.rank_promotion("allow")
-def test_a_report_that_cannot_be_written_is_told_before_it_is_drawn(tiny_run, tmp_path, monkeypatch, capsys):
+def test_unwritable_report_is_error_before_drawing(tiny_run, tmp_path, monkeypatch, capsys):
     folder = shutil.copytree(tiny_run.folder, tmp_path / "run")
     (folder / "report.png").unlink()
     (folder / "report.png").mkdir()

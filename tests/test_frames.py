@@ -1,4 +1,4 @@
-"""Symmetries are those of the physics, and a robot's own frame does not see the world turn."""
+"""The symmetries match the physics, and the robot's own frame is invariant to rotations of the world."""
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from ct_envs.physics import PhysicsState
 from ct_envs.robots import Robot
 
 OPEN = make_maze(np.pad(np.zeros((7, 7), bool), 1, constant_values=True))
-CENTRE = 18.0  # [m], of the maze
+CENTRE = 18.0  # centre of the maze [m]
 
 
 def drive(robot: Robot, proprio: jax.Array, ctrls: jax.Array) -> jax.Array:
-    """Positions about the centre and proprioception [T, G, 2 + P] under ctrls [T, G, A], each in its own world."""
+    """Positions relative to the centre, and proprioception [T, G, 2 + P], for ctrls [T, G, A] in G worlds."""
     env = MazeEnv(robot, engine="mujoco", maps=False)
     nq = env.engine.model.nq
     qpos = jnp.concatenate([jnp.full((len(proprio), 2), CENTRE), proprio[:, : nq - 2]], 1)
@@ -34,12 +34,12 @@ def first_proprio(robot: Robot) -> jax.Array:
 
 
 @pytest.mark.parametrize(("robot", "size"), [(POINT, 8), (ANT, 32), (HUMANOID, 8)], ids=["point", "ant", "humanoid"])
-def test_a_symmetric_world_behaves_symmetrically(robot, size):
+def test_physics_is_symmetric(robot, size):
     group = symmetries(robot)
     assert len(group.world) == len(group.proprio) == len(group.action) == size
     np.testing.assert_array_equal(group.action[0], np.eye(group.action.shape[1]))
     proprio = first_proprio(robot)
-    steps = 4  # later the ant's contacts amplify rounding
+    steps = 4  # with more steps, contacts of the ant amplify rounding
     ctrl = jax.random.uniform(jax.random.key(2), (steps, group.action.shape[1]), minval=-1.0, maxval=1.0)
     after = np.asarray(
         drive(robot, jnp.einsum("gij,j->gi", group.proprio, proprio), jnp.einsum("gij,tj->tgi", group.action, ctrl))
@@ -64,8 +64,8 @@ def test_symmetries_are_a_group(robot):
 
 
 @pytest.mark.parametrize(("robot", "size"), [(POINT, 1), (ANT, 4), (HUMANOID, 4)], ids=["point", "ant", "humanoid"])
-def test_turns_are_what_the_body_does_not_feel(robot, size):
-    """Quarters of the world's circle; of the point, whose action is a vector of the world, none but nothing."""
+def test_turns_do_not_change_joints(robot, size):
+    """They are quarter turns of the world. The point has only the identity, because its action is a world vector."""
     group = turns(symmetries(robot))
     angles = np.arctan2(group.world[:, 1, 0], group.world[:, 0, 0])
     np.testing.assert_allclose(np.sort(angles % (2 * np.pi)), np.arange(size) * np.pi / 2, atol=1e-6)
@@ -76,7 +76,7 @@ def test_turns_are_what_the_body_does_not_feel(robot, size):
         np.testing.assert_allclose(heading, transform(group.world, own_frame(proprio)[0]), atol=1e-5)
 
 
-def test_own_frame_does_not_see_the_world_turn():
+def test_own_frame_is_invariant_to_rotation():
     proprio = first_proprio(ANT)
     angle = 0.7
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -96,6 +96,6 @@ def test_own_frame_does_not_see_the_world_turn():
     np.testing.assert_allclose(own_frame(-proprio.at[5:].multiply(-1).at[0].multiply(-1))[1], own, atol=1e-5)  # -q is q
 
 
-def test_a_robot_without_known_symmetries_is_refused():
+def test_robot_without_symmetries_is_error():
     with pytest.raises(UserError, match="no known symmetries"):
         symmetries(Robot(**{**POINT.__dict__, "name": "stranger"}))

@@ -1,4 +1,4 @@
-"""Python that compiled programs call by name: it gets XLA's own buffers, and what it raises is told."""
+"""Python functions that compiled programs call by name: they get XLA's buffers, and their exceptions are raised."""
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,13 @@ def call(name, argument, *shape):
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (0, 3)])
-def test_shapes_and_values_arrive(shape):
+def test_function_gets_shapes_and_values(shape):
     host_call.register("test_twice", lambda x, y: np.copyto(y, 2 * x))
     x = jnp.asarray(np.random.default_rng(0).normal(size=shape), jnp.float32)
     np.testing.assert_array_equal(jax.jit(lambda x: call("test_twice", x, *shape))(x), 2 * x)
 
 
-def test_a_batch_is_one_call():
+def test_batch_is_one_call():
     shapes = []
 
     def total(x, y):
@@ -34,13 +34,13 @@ def test_a_batch_is_one_call():
     assert shapes == [((2, 4, 3), (2, 4))]
 
 
-def test_the_first_function_of_a_name_stays():
+def test_first_function_with_name_is_kept():
     host_call.register("test_one", lambda x, y: np.copyto(y, x + 1))
     host_call.register("test_one", lambda x, y: np.copyto(y, x + 2))
     assert call("test_one", jnp.zeros(())) == 1.0
 
 
-def test_an_exception_is_told_and_the_next_call_works():
+def test_exception_is_raised_and_next_call_works():
     def picky(x, y):
         if x < 0:
             raise ValueError(f"no roots of {x:.1f}")

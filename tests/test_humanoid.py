@@ -1,4 +1,4 @@
-"""The humanoid: its body, its falls, its limbs at walls, and both engines moving it alike."""
+"""The humanoid: its body, falls, contacts of its limbs with walls, and the agreement of both engines."""
 
 import functools
 
@@ -33,7 +33,7 @@ def keys(seed: int, n: int = N) -> jax.Array:
 # ----------------------------------------------------------------------------------------------------- the body
 
 
-def test_the_body_is_that_of_gymnasiums_humanoid():
+def test_body_equals_gymnasium_humanoid():
     """Numbers of the ``humanoid.xml`` of gymnasium 1.4.0 (Humanoid-v5), computed by MuJoCo. It has the same joints in
     the same order, so its whole mass matrix, here in a bent pose, can be compared. Two numbers of its right leg differ
     from the left one's: ours are the left one's."""
@@ -48,7 +48,7 @@ def test_the_body_is_that_of_gymnasiums_humanoid():
     leg, right_arm, left_arm = [[-25, 5], [-60, 35], [-110, 20], [-160, -2]], [[-85, 60]] * 2, [[-60, 85]] * 2
     ranges = [[-45, 45], [-75, 30], [-35, 35], *leg, *leg, *right_arm, [-90, 50], *left_arm, [-90, 50]]
     np.testing.assert_allclose(np.rad2deg(model.jnt_range[1:]), ranges)
-    right_knee, right_hip_y = 1, 0.01  # of gymnasium's: 0 and 0.008
+    right_knee, right_hip_y = 1, 0.01  # gymnasium has 0 and 0.008
     stiffness = [20, 10, 10, 10, 10, 20, right_knee, 10, 10, 20, 1, 1, 1, 0, 1, 1, 0]
     np.testing.assert_array_equal(model.jnt_stiffness[1:], stiffness)
     np.testing.assert_array_equal(model.dof_damping[6:], [*[5] * 6, 1, *[5] * 3, 1, *[1] * 6])
@@ -70,7 +70,7 @@ def test_the_body_is_that_of_gymnasiums_humanoid():
     np.testing.assert_allclose(np.triu(matrix, 1).sum(), 33.78490791, atol=1e-7)
 
 
-def test_it_begins_upright_looks_anywhere_and_stands_on_its_feet():
+def test_reset_is_standing_with_random_heading():
     state = compiled(auto_reset=False)[0](keys(1, 200), UMAZE, STANDING)
     heading, own = own_frame(state.obs["proprio"])
     np.testing.assert_allclose(own[:, 1:4], [[0.0, 0.0, 1.0]] * 200, atol=1e-6)
@@ -87,7 +87,7 @@ def test_it_begins_upright_looks_anywhere_and_stands_on_its_feet():
     )
 
 
-def test_it_begins_as_far_from_facing_its_goal_as_it_is_told():
+def test_turn_rad_limits_initial_heading():
     reset = compiled(auto_reset=False)[0]
     for turn in (0.0, 0.5, np.pi):
         state = reset(keys(1, 200), UMAZE, STANDING.replace(turn_rad=jnp.asarray(turn, jnp.float32)))
@@ -96,7 +96,7 @@ def test_it_begins_as_far_from_facing_its_goal_as_it_is_told():
         assert away.max() <= turn + 1e-3 and away.max() > 0.9 * turn
 
 
-def test_an_action_is_a_share_of_the_actuators_range():
+def test_action_is_share_of_actuator_range():
     reset, step = compiled(auto_reset=False)
     state, action = reset(keys(0), UMAZE, STANDING), jnp.broadcast_to(jnp.linspace(-1.0, 1.0, 17), (N, 17))
     engine, parked = make_engine("mujoco", HUMANOID), jnp.full((N, 3, 3), -1000.0)
@@ -107,14 +107,14 @@ def test_an_action_is_a_share_of_the_actuators_range():
 # -------------------------------------------------------------------------------------------------------- falls
 
 
-def test_left_alone_it_falls_which_is_a_failure():
+def test_humanoid_falls_without_actions():
     reset, step = compiled(auto_reset=False)
     state = reset(keys(0), UMAZE, STANDING.replace(goal=jnp.array([[6.2, 6.0]])))
     lying = state.pipeline_state.qpos.at[1, 2:7].set(jnp.array([0.3, np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]))
     state = state.replace(pipeline_state=state.pipeline_state.replace(qpos=lying))
     state = step(state, jnp.zeros((N, 17)))
     np.testing.assert_array_equal(state.info["fall"], [0, 1, 0, 0])
-    np.testing.assert_array_equal(state.info["success"], [1, 0, 1, 1])  # a fall at the goal is none
+    np.testing.assert_array_equal(state.info["success"], [1, 0, 1, 1])  # a fall at the goal is not a success
     state = reset(keys(0), UMAZE, STANDING)
     for _ in range(100):
         state = step(state, jnp.zeros((N, 17)))
@@ -125,7 +125,7 @@ def test_left_alone_it_falls_which_is_a_failure():
 # ---------------------------------------------------------------------------------------------- walls and engines
 
 
-def test_every_limb_is_stopped_by_walls_and_floor():
+def test_all_limbs_collide_with_walls_and_floor():
     model = build_model(HUMANOID)
     names = [model.geom(i).name for i in range(model.ngeom)]
     limbs = [i for i, name in enumerate(names) if not name.startswith(("wall", "floor"))]
@@ -136,8 +136,8 @@ def test_every_limb_is_stopped_by_walls_and_floor():
             assert model.geom_contype[limb] & model.geom_conaffinity[obstacle]
 
 
-def test_no_limb_reaches_farther_than_the_walls_are_looked_for():
-    """In any pose of its joints, leaning as far as a robot does that has not fallen."""
+def test_limbs_stay_within_touch_distance():
+    """In any pose of its joints, and at the largest tilt without a fall."""
     model = mujoco.MjModel.from_xml_string(model_xml(HUMANOID))
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(2000):

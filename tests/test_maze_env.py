@@ -1,4 +1,4 @@
-"""MazeEnv: pure, one program for every maze, and honest at the end of an episode."""
+"""MazeEnv: pure functions, one program for all mazes, and correct outcomes at the end of an episode."""
 
 import functools
 from collections import Counter
@@ -18,7 +18,7 @@ from ct_envs.occupancy import local_map
 N = 8
 UMAZE = load_maze("antmaze-umaze")
 LARGE = load_maze("antmaze-large")
-NEAR = Tasks(  # reached by standing still, by going right for a step or two, and not within the horizon
+NEAR = Tasks(  # the goal is reached without motion; after a step or two to the right; not within the horizon
     start=jnp.array([[6.0, 6.0], [6.0, 6.0], [6.0, 6.0]]),
     goal=jnp.array([[6.0, 6.2], [6.9, 6.0], [13.0, 14.0]]),
     n=jnp.array(3),
@@ -27,22 +27,22 @@ NEAR = Tasks(  # reached by standing still, by going right for a step or two, an
 
 @functools.cache
 def compiled(engine: str = "mujoco", **options):
-    """The step of N environments at once. Tests of the same options share the program."""
+    """The compiled step of N environments. Tests with the same options share the program."""
     return jax.jit(jax.vmap(MazeEnv(POINT, engine=engine, **options).step))
 
 
-# Beginnings are the same whatever the options; one maze and one set of tasks serve all N.
+# Resets do not depend on the options. All N environments have the same maze and tasks.
 reset = jax.jit(jax.vmap(MazeEnv(POINT, engine="mujoco").reset, (0, None, None)))
 HORIZON = 4
 
 
 def far(tasks: Tasks) -> Tasks:
-    """Only the last of three tasks."""
+    """Tasks with only the last of three tasks."""
     return tasks.replace(start=jnp.tile(tasks.start[2:], (3, 1)), goal=jnp.tile(tasks.goal[2:], (3, 1)))
 
 
 def at_step(state, number: int):
-    """The state with its clocks set to that number of steps."""
+    """The state with its step counters set to this number."""
     steps = jnp.full_like(state.pipeline_state.episode_steps, number)
     return state.replace(pipeline_state=state.pipeline_state.replace(episode_steps=steps))
 
@@ -56,7 +56,7 @@ def actions(seed: int, length: int, n: int = N) -> jax.Array:
 
 
 def assert_same(a, b, **tolerance) -> None:
-    """Two states hold the same numbers; keys are compared as they are."""
+    """Compare two states; random keys must be identical."""
 
     def plain(leaf):
         return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
@@ -67,7 +67,7 @@ def assert_same(a, b, **tolerance) -> None:
 # --------------------------------------------------------------------------------------------------- contract
 
 
-def test_it_is_a_brax_environment():
+def test_maze_env_is_brax_environment():
     env = MazeEnv("point", engine="mujoco", maze=UMAZE)
     assert isinstance(env, brax.envs.Env)
     assert env.backend == "mujoco"
@@ -78,10 +78,10 @@ def test_it_is_a_brax_environment():
     assert after.reward.shape == after.done.shape == (2,)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state) == jax.tree.map(
         lambda leaf: (leaf.shape, leaf.dtype), after
-    )  # so it can be scanned
+    )  # so it can be used in a scan
 
 
-def test_observations_without_maps_are_the_others():
+def test_observations_without_maps_have_other_entries():
     step, bare_step = compiled(horizon=HORIZON), compiled(horizon=HORIZON, maps=False)
     assert MazeEnv(engine="mujoco", maps=False).observation_size == {"proprio": (2,), "goal": (2,)}
     state = reset(keys(1), UMAZE, None)
@@ -92,7 +92,7 @@ def test_observations_without_maps_are_the_others():
         assert_same({name: state.obs[name] for name in bare.obs}, bare.obs)
 
 
-def test_what_is_not_known_is_refused():
+def test_unknown_names_are_error():
     with pytest.raises(UserError, match=", ".join(name for name, robot in ROBOTS.items() if robot.course == "maze")):
         MazeEnv("unicycle")
     with pytest.raises(UserError, match="mjx, mujoco"):
@@ -115,7 +115,7 @@ def test_reset_and_step_are_deterministic():
 
 
 @pytest.mark.parametrize("auto_reset", [True, False])
-def test_a_step_leaves_its_argument_alone(auto_reset):
+def test_step_does_not_change_its_argument(auto_reset):
     env = MazeEnv(engine="mujoco", auto_reset=auto_reset)
 
     def look(key, action):
@@ -128,7 +128,7 @@ def test_a_step_leaves_its_argument_alone(auto_reset):
     jax.eval_shape(look, jax.random.key(0), jnp.zeros(2))
 
 
-def test_jit_changes_nothing():
+def test_jit_does_not_change_results():
     env = MazeEnv(POINT, engine="mujoco", horizon=HORIZON)
     path, step = actions(3, HORIZON + 1), compiled(horizon=HORIZON)
     state = reset(keys(3), UMAZE, NEAR)
@@ -148,7 +148,7 @@ def test_each_environment_has_its_own_maze():
     assert_same(state.info["maze"], stack_mazes(singles))
     together = [state := step(state, action) for action in actions(4, 4)]
     for i in range(4):
-        alone = alike[i]  # the others run in this maze too, and are not looked at
+        alone = alike[i]  # the other environments are in this maze, too; only the i-th is compared
         for action, other in zip(actions(4, 4), together, strict=True):
             alone = step(alone, action)
             assert_same(*(jax.tree.map(lambda leaf: leaf[i], s.obs) for s in (alone, other)), atol=1e-5)  # noqa: B023
@@ -177,7 +177,7 @@ def test_many_mazes_compile_once():
 
 
 @pytest.mark.parametrize("maze", [LARGE, UMAZE], ids=["large", "umaze"])
-def test_observation_and_reward_are_of_the_state_after_the_step(maze):
+def test_observation_and_reward_are_after_step(maze):
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(5), maze, None)
     for action in actions(5, HORIZON - 1):
@@ -199,8 +199,8 @@ def test_actions_beyond_one_are_clipped():
     assert_same(step(state, action), step(state, jnp.clip(action, -1, 1)))
 
 
-def test_collision_is_told_while_a_wall_is_touched(wall_distance):
-    """The engines tell it of the last substep's beginning, so a first or last touch may go unseen."""
+def test_collision_is_reported_during_contact(wall_distance):
+    """The engines report contacts at the start of the last substep, so the first or last contact may be missed."""
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(7), LARGE, None)
     distances, told = [], []
@@ -211,14 +211,14 @@ def test_collision_is_told_while_a_wall_is_touched(wall_distance):
     distance, told = np.stack(distances), np.stack(told) > 0
     touching = distance < POINT.radius_m
     steady = (np.abs(distance - POINT.radius_m) > 1e-3)[1:] & (touching[1:] == touching[:-1])
-    assert (told == touching)[1:][steady].mean() > 0.98  # but for a touch between two steps
+    assert (told == touching)[1:][steady].mean() > 0.98  # except contacts between two steps
     assert 0.1 < told[1:][steady].mean() < 0.9 and steady.mean() > 0.8
 
 
 # --------------------------------------------------------------------------------------- starts, goals, tasks
 
 
-def test_starts_and_goals_are_clear_of_walls_and_in_one_region(wall_distance):
+def test_starts_and_goals_are_free_and_connected(wall_distance):
     walls = parse_walls("#######\n#..#..#\n#..#..#\n#######")
     states = [reset(batch, make_maze(walls), None) for batch in keys(8, 128).reshape(-1, N)]
     start, goal = (np.concatenate([state.info[name] for state in states]) for name in ("position", "goal"))
@@ -230,7 +230,7 @@ def test_starts_and_goals_are_clear_of_walls_and_in_one_region(wall_distance):
     assert not any(np.asarray(state.pipeline_state.qvel).any() for state in states)
 
 
-def test_tasks_are_drawn_from_the_first_n_at_resets_and_later():
+def test_only_first_n_tasks_are_drawn():
     step = compiled(horizon=HORIZON)
     row = jnp.arange(3.0)[:, None]
     tasks = Tasks(start=6.0 + 0.1 * row * jnp.ones((1, 2)), goal=14.0 + row * jnp.ones((1, 2)), n=jnp.array(2))
@@ -245,7 +245,7 @@ def test_tasks_are_drawn_from_the_first_n_at_resets_and_later():
     assert (seen[0] != seen[-1]).any()
 
 
-def test_the_speed_after_a_reset_has_the_spread_asked_for():
+def test_reset_velocity_has_given_deviation():
     env = MazeEnv(engine="mujoco", maps=False, reset_velocity_mps=2.0)
     velocity = np.asarray(jax.jit(jax.vmap(env.reset, (0, None)))(keys(10, 400), LARGE).obs["proprio"])
     assert velocity.std() == pytest.approx(2.0, rel=0.1)
@@ -255,8 +255,8 @@ def test_the_speed_after_a_reset_has_the_spread_asked_for():
 # ------------------------------------------------------------------------------------------- how episodes end
 
 
-def test_auto_reset_tells_of_the_finished_episode_and_begins_a_fresh_one(wall_distance):
-    """Beside an environment without it: outcomes are the same at every step, and what follows unless done."""
+def test_auto_reset_returns_outcome_and_new_episode(wall_distance):
+    """Compared with an environment without auto-reset: the outcomes are equal, and so are unfinished states."""
     step, plain_step = compiled(horizon=HORIZON), compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(11), UMAZE, NEAR)
     outcomes = Counter()
@@ -264,7 +264,7 @@ def test_auto_reset_tells_of_the_finished_episode_and_begins_a_fresh_one(wall_di
         after, plain = step(state, action), plain_step(state.replace(done=jnp.zeros(N)), action)
         for name in ("success", "truncation", "collision"):
             np.testing.assert_array_equal(after.info[name], plain.info[name])
-        np.testing.assert_array_equal(after.done, plain.executed)
+        np.testing.assert_array_equal(after.done, plain.done)
         np.testing.assert_allclose(after.reward, plain.reward, rtol=1e-5)
         done = np.asarray(after.done) > 0
         pick = lambda state: (state.pipeline_state, state.obs, state.info["goal"], state.info["episode_steps"])  # noqa: E731
@@ -278,7 +278,7 @@ def test_auto_reset_tells_of_the_finished_episode_and_begins_a_fresh_one(wall_di
     assert set(outcomes) == {(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)}  # never success and truncation at once
 
 
-def test_every_auto_reset_draws_a_fresh_start_and_goal():
+def test_auto_reset_draws_new_start_and_goal():
     step, state = compiled(horizon=HORIZON), reset(keys(12), LARGE, None)
     starts, goals = [state.info["position"]], [state.info["goal"]]
     for _ in range(6):
@@ -290,7 +290,7 @@ def test_every_auto_reset_draws_a_fresh_start_and_goal():
         assert len(np.unique(np.concatenate(drawn), axis=0)) == 7 * N
 
 
-def test_the_horizon_truncates():
+def test_horizon_truncates():
     step, state = compiled(horizon=HORIZON, auto_reset=False), reset(keys(13), UMAZE, far(NEAR))
     for i in range(1, HORIZON + 1):
         state = step(state, jnp.zeros((N, 2)))
@@ -300,8 +300,8 @@ def test_the_horizon_truncates():
         assert (state.info["success"] == 0).all()
 
 
-def test_success_at_the_horizon_is_no_truncation():
-    """The goal is where the robot comes just when time is up."""
+def test_success_at_horizon_is_not_truncation():
+    """The robot reaches the goal in the last step of the horizon."""
     step, right = compiled(horizon=HORIZON, auto_reset=False), jnp.broadcast_to(jnp.array([1.0, 0.0]), (N, 2))
     states = [reset(keys(14), UMAZE, far(NEAR))]
     for _ in range(HORIZON):
@@ -316,7 +316,7 @@ def test_success_at_the_horizon_is_no_truncation():
         assert (state.info["truncation"] == 0).all()
 
 
-def test_success_is_being_within_the_goal_tolerance():
+def test_success_is_within_goal_tolerance():
     step = compiled(horizon=HORIZON, auto_reset=False)
     inner, outer = POINT.goal_tolerance_m - 0.01, POINT.goal_tolerance_m + 0.01
     for distance, success in ((inner, 1), (outer, 0)):
@@ -326,7 +326,7 @@ def test_success_is_being_within_the_goal_tolerance():
         assert (state.info["success"] == success).all() and (state.done == success).all()
 
 
-def test_without_auto_reset_a_finished_environment_stays_as_it_is():
+def test_finished_environment_does_not_change_without_auto_reset():
     step, state = compiled(horizon=HORIZON, auto_reset=False), reset(keys(16), UMAZE, NEAR)
     for action in actions(16, 6):
         after = step(state, action)
@@ -340,8 +340,8 @@ def test_without_auto_reset_a_finished_environment_stays_as_it_is():
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("what", ["action", "state"])
-def test_what_is_not_finite_ends_its_episode_and_no_other(monkeypatch, tmp_path, engine, bad, what):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning of a state there
+def test_non_finite_values_end_their_own_episode_only(monkeypatch, tmp_path, engine, bad, what):
+    monkeypatch.chdir(tmp_path)  # MuJoCo would write its log file there
     step, state, action = compiled(engine, horizon=HORIZON), reset(keys(17), LARGE, None), actions(17, 1)[0]
     clean = step(state, action)
     sick = np.arange(N) == 3
@@ -365,7 +365,7 @@ def test_what_is_not_finite_ends_its_episode_and_no_other(monkeypatch, tmp_path,
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_without_auto_reset_an_action_that_is_not_finite_leaves_the_robot_where_it_was(bad):
+def test_non_finite_action_keeps_previous_state(bad):
     step = compiled(horizon=HORIZON, auto_reset=False)
     state = reset(keys(18), LARGE, None)
     after = step(state, jnp.full((N, 2), bad))
@@ -404,36 +404,36 @@ def assert_one_line(call, match: str) -> None:
 
 
 @pytest.mark.parametrize("change", WRONG_SHAPES, ids=lambda change: " ".join(change))
-def test_tasks_of_wrong_shapes_are_refused_traced_or_not(change):
+def test_tasks_with_wrong_shapes_are_error_also_if_traced(change):
     tasks = NEAR.replace(**change)
     for call in (ENV.reset, jax.jit(ENV.reset), lambda *a: jax.eval_shape(ENV.reset, *a)):
         assert_one_line(lambda: call(jax.random.key(0), UMAZE, tasks), f"tasks.({'|'.join(change)}) ")  # noqa: B023
 
 
 @pytest.mark.parametrize(("change", "match"), WRONG_VALUES, ids=lambda value: value if isinstance(value, str) else "")
-def test_tasks_that_do_not_fit_the_maze_are_refused(change, match):
+def test_invalid_tasks_are_error(change, match):
     tasks = NEAR.replace(**change)
     assert_one_line(lambda: ENV.reset(jax.random.key(0), UMAZE, tasks), match)
     assert_one_line(lambda: check_tasks(tasks, UMAZE), match)
     for shared in (jax.vmap(ENV.reset, (0, None, None)), lambda *a: jax.jit(lambda k: ENV.reset(k, *a[1:]))(a[0][0])):
         assert_one_line(lambda: shared(keys(0, 2), UMAZE, tasks), match)  # noqa: B023
-    jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE, tasks)  # without values, nobody can tell
+    jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE, tasks)  # without values, no error
 
 
-def test_tasks_that_are_never_drawn_may_be_anything():
+def test_padding_of_tasks_is_not_checked():
     tasks = NEAR.replace(n=jnp.array(2), start=NEAR.start.at[2].set(jnp.nan), goal=NEAR.goal.at[2].set(2.0))
     ENV.reset(jax.random.key(0), UMAZE, tasks)
     ENV.reset(jax.random.key(0), UMAZE, tasks.replace(follow=jnp.array([[1], [0], [1]])))
 
 
-def test_tasks_out_of_reach_of_any_check_are_what_the_docstring_says():
+def test_wrong_traced_tasks_behave_as_documented():
     begin = jax.jit(lambda tasks: ENV.reset(jax.random.key(0), UMAZE, tasks).pipeline_state)
     assert begin(NEAR.replace(n=jnp.array(0))).task == 0
     far = NEAR.replace(n=jnp.array(10**9))
     np.testing.assert_array_equal(begin(far).goal, NEAR.goal[2])
 
 
-def test_a_maze_of_other_cells_and_many_mazes_are_refused():
+def test_wrong_cell_size_and_stacked_mazes_are_error():
     other = load_maze("antmaze-umaze", cell_m=3.0)
     for call in (ENV.reset, jax.vmap(ENV.reset, (0, None))):
         key = jax.random.key(0) if call == ENV.reset else keys(0, 2)
@@ -445,7 +445,7 @@ def test_a_maze_of_other_cells_and_many_mazes_are_refused():
 
 
 @pytest.mark.parametrize("shape", [(1,), (), (3,), (1, 2), (2, 2)])
-def test_an_action_of_another_shape_is_refused_traced_or_not(shape):
+def test_action_with_wrong_shape_is_error_also_if_traced(shape):
     state = jax.eval_shape(ENV.reset, jax.random.key(0), UMAZE)
     for call in (ENV.step, jax.jit(ENV.step)):
         assert_one_line(lambda: jax.eval_shape(call, state, jnp.ones(shape)), "action has shape")  # noqa: B023

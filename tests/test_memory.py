@@ -1,4 +1,4 @@
-"""Memory that is given back holds what it held."""
+"""Returned memory pages keep their contents."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ MEGABYTES = 64
 
 
 def dirty_mb() -> float:
-    """Memory that is this process's alone, and written [MB]."""
+    """Private memory of this process that has been written [MB]."""
     return next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if "Private_Dirty" in line) / 1024
 
 
 def fill(array: np.ndarray, pattern: str) -> None:
-    array[:] = 0  # written, so that the system has to hold it
+    array[:] = 0  # write it, so that the system allocates the pages
     if pattern == "ones":
         array[:] = 1
     elif pattern == "some":
@@ -28,7 +28,7 @@ def fill(array: np.ndarray, pattern: str) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["zeros", "ones", "some", "ends"])
-def test_what_is_in_memory_stays_and_zeros_take_none(pattern):
+def test_contents_are_kept_and_zero_pages_are_returned(pattern):
     with zeros_given_back():
         array = np.empty(MEGABYTES * 2**20, np.uint8)
         fill(array, pattern)
@@ -38,11 +38,11 @@ def test_what_is_in_memory_stays_and_zeros_take_none(pattern):
     fill(expected, pattern)
     assert (array == expected).all()
     assert (freed > MEGABYTES - 25) == (pattern != "ones") and (pattern != "ones" or abs(freed) < 5)
-    array[:] = 2  # and it can be written
+    array[:] = 2  # it can still be written
     assert (array == 2).all()
 
 
-def test_what_was_there_before_is_left_alone():
+def test_earlier_memory_is_not_changed():
     array = np.empty(MEGABYTES * 2**20, np.uint8)
     array[:] = 0
     before = dirty_mb()

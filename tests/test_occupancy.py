@@ -1,4 +1,4 @@
-"""The local occupancy map, against a plain loop over its cells and under the symmetries of the square."""
+"""The local occupancy map, compared with a plain loop over its cells, and under the symmetries of the square."""
 
 import functools
 
@@ -12,7 +12,7 @@ from ct_envs import UserError, load_maze, make_maze, random_walls
 from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, MAP_CELLS, lidar_map, local_map
 
 SEEDS = st.integers(0, 2**31 - 1)
-CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the second is our setting, the first the Turtlebot3's
+CELLS = st.sampled_from([0.08, 0.8, 1.3])  # the first is that of the Turtlebot3, the second that of the mazes
 WORLDS = st.builds(lambda seed: random_walls(seed, height=9, width=12, density=0.7), SEEDS)
 
 
@@ -22,7 +22,7 @@ def draw(walls_maze, position, goal, cell_m, cells=MAP_CELLS):
 
 
 def naive(walls: np.ndarray, position, goal, cell_m: float, cells: int = MAP_CELLS) -> np.ndarray:
-    """The same map, cell after cell, from the words of the docstring."""
+    """The same map, computed cell by cell from the definition in the docstring."""
     picture = np.zeros((2, cells, cells))
     for i in range(cells):
         for j in range(cells):
@@ -36,7 +36,7 @@ def naive(walls: np.ndarray, position, goal, cell_m: float, cells: int = MAP_CEL
 
 
 def draw_pose(seed: int, walls: np.ndarray, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """A position anywhere and a goal near its window, such that no point of the map is on a cell's border."""
+    """A random position, and a goal near its window. No point of the map is on the border of a cell."""
     rng = np.random.default_rng(seed)
     position = rng.random(2) * np.array(walls.shape[::-1]) * 4.0
     goal = position + rng.uniform(-0.7, 0.7, 2) * MAP_CELLS * cell_m
@@ -49,7 +49,7 @@ def draw_pose(seed: int, walls: np.ndarray, cell_m: float) -> tuple[np.ndarray, 
 
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=40)
-def test_the_map_is_what_a_plain_loop_draws(walls, seed, cell_m):
+def test_map_equals_plain_loop(walls, seed, cell_m):
     position, goal = draw_pose(seed, walls, cell_m)
     picture = draw(make_maze(walls), position, goal, np.float32(cell_m))
     np.testing.assert_array_equal(picture, naive(walls, position, goal, cell_m))
@@ -57,7 +57,7 @@ def test_the_map_is_what_a_plain_loop_draws(walls, seed, cell_m):
 
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=40)
-def test_the_goal_is_one_cell_just_when_the_window_holds_it(walls, seed, cell_m):
+def test_goal_is_one_cell_if_inside_window(walls, seed, cell_m):
     position, goal = draw_pose(seed, walls, cell_m)
     channel = np.asarray(draw(make_maze(walls), position, goal, np.float32(cell_m)))[1]
     held = np.abs(goal - position).max() < MAP_CELLS * cell_m / 2
@@ -73,8 +73,8 @@ def test_the_goal_is_one_cell_just_when_the_window_holds_it(walls, seed, cell_m)
 @pytest.mark.parametrize("flip_x", [False, True])
 @given(WORLDS, SEEDS, CELLS)
 @settings(max_examples=10)
-def test_the_map_turns_with_the_world(flip_x, flip_y, transpose, walls, seed, cell_m):
-    """The 8 symmetries of the square: the map of the image is the image of the map."""
+def test_map_is_equivariant(flip_x, flip_y, transpose, walls, seed, cell_m):
+    """For the 8 symmetries of the square: the map of the transformed world is the transformed map."""
 
     def image(grid: np.ndarray) -> np.ndarray:
         grid = grid[..., :: -1 if flip_y else 1, :: -1 if flip_x else 1]
@@ -93,7 +93,7 @@ def test_the_map_turns_with_the_world(flip_x, flip_y, transpose, walls, seed, ce
 
 @given(WORLDS, SEEDS)
 @settings(max_examples=10)
-def test_the_number_of_cells_crops_the_window(walls, seed):
+def test_number_of_cells_crops_window(walls, seed):
     position, goal = draw_pose(seed, walls, 0.8)
     full = np.asarray(draw(make_maze(walls), position, goal, np.float32(0.8)))
     small = draw(make_maze(walls), position, goal, np.float32(0.8), cells=9)
@@ -102,8 +102,8 @@ def test_the_number_of_cells_crops_the_window(walls, seed):
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_the_cell_size_scales_the_window(seed):
-    """A world twice as large through cells twice as large looks the same."""
+def test_cell_size_scales_window(seed):
+    """A world twice as large, with cells twice as large, gives the same map."""
     walls = random_walls(seed)
     position, goal = draw_pose(seed, walls, 0.8)
     one = draw(make_maze(walls, cell_m=4.0), position, goal, np.float32(0.8))
@@ -111,7 +111,7 @@ def test_the_cell_size_scales_the_window(seed):
     np.testing.assert_array_equal(one, two)
 
 
-def test_maps_are_small_arrays_of_zeros_and_ones():
+def test_maps_are_uint8_zeros_and_ones():
     picture = np.asarray(draw(load_maze("hall"), np.float32([6, 6]), np.float32([7, 7]), np.float32(0.8)))
     assert picture.shape == (2, MAP_CELLS, MAP_CELLS) == (2, 25, 25)
     assert picture.dtype == np.uint8
@@ -123,7 +123,7 @@ def test_maps_are_small_arrays_of_zeros_and_ones():
 
 
 def draw_ranges(seed: int) -> np.ndarray:
-    """Ranges of which half are within the metre, none of them ending near a cell's border."""
+    """Random ranges; half of them are below 1 m. No beam ends near the border of a cell."""
     ranges = np.random.default_rng(seed).uniform(0.1, 1.9, LIDAR_BEAMS)
     angle = np.radians(np.arange(LIDAR_BEAMS))
     ticks = ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1) / LIDAR_CELL_M + 0.5
@@ -133,7 +133,7 @@ def draw_ranges(seed: int) -> np.ndarray:
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_a_lidar_marks_the_cells_its_beams_end_in_and_no_others(seed):
+def test_lidar_marks_exactly_the_end_cells_of_beams(seed):
     ranges = draw_ranges(seed)
     angle = np.radians(np.arange(LIDAR_BEAMS))
     expected = np.zeros((MAP_CELLS, MAP_CELLS), np.uint8)
@@ -147,8 +147,8 @@ def test_a_lidar_marks_the_cells_its_beams_end_in_and_no_others(seed):
 
 @given(SEEDS, st.integers(0, 3))
 @settings(max_examples=20)
-def test_the_lidar_map_turns_with_the_world(seed, quarters):
-    """Beams a quarter turn on, or a robot that has turned by one: the map is turned by one."""
+def test_lidar_map_is_equivariant_to_rotation(seed, quarters):
+    """A rotation of the beams or of the robot by a quarter turn rotates the map by a quarter turn."""
     ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
     here = lidar_map(ranges, goal)
     a = quarters * np.pi / 2
@@ -160,7 +160,7 @@ def test_the_lidar_map_turns_with_the_world(seed, quarters):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_left_and_right_of_a_lidar_are_mirrored(seed):
+def test_lidar_map_is_equivariant_to_reflection(seed):
     ranges, goal = draw_ranges(seed), np.random.default_rng(seed).uniform(-0.9, 0.9, 2)
     mirrored = lidar_map(np.roll(ranges[::-1], 1), goal * [1, -1])
     np.testing.assert_array_equal(mirrored, lidar_map(ranges, goal)[:, ::-1])
@@ -168,7 +168,7 @@ def test_left_and_right_of_a_lidar_are_mirrored(seed):
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_a_batch_of_lidars_is_one_after_the_other(seed):
+def test_batch_of_lidars_equals_single_ones(seed):
     ranges = np.stack([draw_ranges(seed + i) for i in range(6)]).reshape(2, 3, LIDAR_BEAMS)
     rng = np.random.default_rng(seed)
     goal, yaw = rng.uniform(-1.2, 1.2, (2, 3, 2)), rng.uniform(-3, 3, (2, 3))
@@ -180,11 +180,11 @@ def test_a_batch_of_lidars_is_one_after_the_other(seed):
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_both_maps_put_the_goal_into_the_same_cell(seed):
+def test_both_maps_have_same_goal_cell(seed):
     goal = np.random.default_rng(seed).uniform(-1.2, 1.2, 2)
     halves = goal / LIDAR_CELL_M + 0.5
     assume(np.abs(halves - np.round(halves)).min() > 1e-3)
-    far = np.float32([50.0, 50.0])  # of an empty room
+    far = np.float32([50.0, 50.0])  # in an empty room
     maze = make_maze(random_walls(0, height=30, width=30, density=0.0))
     drawn = draw(maze, far, far + np.float32(goal), np.float32(LIDAR_CELL_M))
     np.testing.assert_array_equal(lidar_map(np.full(LIDAR_BEAMS, 3.5), goal), drawn)
@@ -207,14 +207,14 @@ def with_beam(value: float) -> np.ndarray:
         (0.5, "no list of ranges"),
     ],
 )
-def test_a_lidar_that_is_wrong_is_one_line(ranges, words):
+def test_wrong_lidar_ranges_are_error_of_one_line(ranges, words):
     with pytest.raises(UserError, match=words) as caught:
         lidar_map(ranges, [1.0, 0.0])
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
-def test_a_beam_without_an_answer_may_be_allowed(value):
+def test_missing_beams_can_be_allowed(value):
     nothing = lidar_map(with_beam(1.0), [1.0, 0.0])
     np.testing.assert_array_equal(lidar_map(with_beam(value), [1.0, 0.0], missing_ok=True), nothing)
     with pytest.raises(UserError):

@@ -1,4 +1,4 @@
-"""Two engines behind one step: they agree, no wall is ever missing, and a NaN stays where it arose."""
+"""The two physics engines: they agree, no wall is missing, and NaN does not spread to other robots."""
 
 import dataclasses
 import functools
@@ -26,13 +26,13 @@ from ct_envs.physics import (
 
 pytestmark = pytest.mark.rank_promotion("allow")  # MJX
 
-N = 32  # robots of a drive; one number, so that one compiled program serves the tests
+N = 32  # number of robots; the same in all tests, so that they share one compiled program
 LARGE = load_walls("antmaze-large")
 
 
 @pytest.fixture(scope="module")
 def engine():
-    """Of that name, made once: a compiled program belongs to its engine."""
+    """Get an engine by name. Each is created once, because compiled programs belong to an engine."""
     return functools.cache(lambda name: make_engine(name, POINT))
 
 
@@ -47,7 +47,7 @@ def step(engine, maze, state, ctrl):
 
 @functools.partial(jax.jit, static_argnums=0)
 def drive(engine, maze, state, ctrls):
-    """States after each of the control steps [T, N, nu], from N states."""
+    """The states after each control step, from N states with ctrls [T, N, nu]."""
 
     def once(state, ctrl):
         walls = jax.vmap(nearest_walls, (None, 0))(maze, state.qpos[:, :2])
@@ -58,7 +58,7 @@ def drive(engine, maze, state, ctrls):
 
 
 def starts(seed: int, walls: np.ndarray, wall_distance, *, speed: float, n: int = N) -> PhysicsState:
-    """Robots that touch no wall, most of them close to one, at ``speed`` [m/s] in any direction."""
+    """Robots without wall contact, most of them close to a wall, with ``speed`` [m/s] in a random direction."""
     rng = np.random.default_rng(seed)
     free = np.argwhere(~walls)[:, ::-1]
     points = (free[rng.integers(len(free), size=200 * n)] + rng.random((200 * n, 2))) * 4.0
@@ -70,7 +70,7 @@ def starts(seed: int, walls: np.ndarray, wall_distance, *, speed: float, n: int 
 
 
 def pushes(seed: int, length: int, n: int = N) -> jax.Array:
-    """Random full throttle, held for some ten steps at a time."""
+    """Random full throttle, constant for about ten steps at a time."""
     rng = np.random.default_rng(seed)
     held = rng.uniform(-1.5, 1.5, (-(-length // 10), n, 2)).clip(-1, 1)
     return jnp.asarray(np.repeat(held, 10, axis=0)[:length], jnp.float32)
@@ -82,8 +82,8 @@ def pushes(seed: int, length: int, n: int = N) -> jax.Array:
 def test_engines_agree_in_free_space_and_at_walls(engine, wall_distance):
     """MJX computes in float32, MuJoCo in float64.
 
-    30 steps of 5 substeps round 150 times, by some 2e-6 m each at coordinates of up to 40 m, and dissipation
-    keeps it from growing. A contact that one engine lacks makes decimetres.
+    30 steps of 5 substeps round 150 times, by about 2e-6 m at coordinates of up to 40 m. Dissipation limits the growth
+    of these errors. A missing contact would cause a difference of decimetres.
     """
     maze = make_maze(LARGE)
     state, ctrls = starts(0, LARGE, wall_distance, speed=2.0), pushes(0, 30)
@@ -99,12 +99,12 @@ def test_engines_agree_in_free_space_and_at_walls(engine, wall_distance):
 
 @pytest.mark.parametrize(
     ("robot", "limb_at_wall", "span", "atol"),
-    # Ant: a slipping foot, or another contact point chosen where a capsule meets a box, is worth centimetres in a step.
+    # Ant: a slipping foot, or another contact point between capsule and box, causes centimetres in a step.
     [(ANT, (4.75, 6.0), 0.3, 5e-2), pytest.param(HUMANOID, (6.0, 4.36), 0.2, 1e-3, marks=pytest.mark.slow)],
 )
-def test_engines_agree_about_walkers(robot, limb_at_wall, span, atol):
-    """MJX computes in float32, MuJoCo in float64: step by step from the same states, under small random torques. A
-    contact that one engine lacks would be worth decimetres."""
+def test_engines_agree_for_ant_and_humanoid(robot, limb_at_wall, span, atol):
+    """Single steps from the same states with small random torques. MJX computes in float32, MuJoCo in float64. A
+    missing contact would cause a difference of decimetres."""
     maze = load_maze("antmaze-umaze")
     engines = [make_engine(name, robot) for name in ("mujoco", "mjx")]
     model = engines[0].model
@@ -125,8 +125,8 @@ def test_engines_agree_about_walkers(robot, limb_at_wall, span, atol):
 
 
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])
-def test_a_step_is_pure(engine, wall_distance, name):
-    """Whatever was stepped before, and whoever is stepped beside it."""
+def test_step_is_pure(engine, wall_distance, name):
+    """The result does not depend on earlier steps or on other robots in the batch."""
     maze = make_maze(LARGE)
     state, other = (starts(seed, LARGE, wall_distance, speed=3.0) for seed in (1, 2))
     ctrl = pushes(1, 1)[0]
@@ -155,7 +155,7 @@ def test_nested_vmap_is_one_flat_batch(engine, wall_distance):
 
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])
 @pytest.mark.parametrize("what", ["qpos", "qvel", "qacc_warmstart", "ctrl"])
-def test_a_nan_never_reaches_another_robot(engine, wall_distance, monkeypatch, tmp_path, name, what):
+def test_nan_does_not_spread_to_other_robots(engine, wall_distance, monkeypatch, tmp_path, name, what):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
     maze = make_maze(LARGE)
     state, ctrl = starts(4, LARGE, wall_distance, speed=3.0), pushes(4, 1)[0]
@@ -167,7 +167,7 @@ def test_a_nan_never_reaches_another_robot(engine, wall_distance, monkeypatch, t
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[~sick], b[~sick]), clean, after)
     if what in ("qpos", "qvel"):
         assert not np.isfinite(np.asarray(after.qpos)[sick]).all(-1).any()
-    healed = step(engine(name), maze, state, ctrl)  # nothing of it stays in the engine
+    healed = step(engine(name), maze, state, ctrl)  # the engine keeps no NaN
     jax.tree.map(np.testing.assert_array_equal, clean, healed)
 
 
@@ -180,7 +180,7 @@ def test_engine_names(engine):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_control_step_is_the_robots(engine):
+def test_control_step_has_duration_of_robot(engine):
     for name in ("mjx", "mujoco"):
         seconds = engine(name).n_substeps * engine(name).model.opt.timestep
         assert seconds == pytest.approx(POINT.control_dt_s)
@@ -191,8 +191,8 @@ def test_a_control_step_is_the_robots(engine):
 
 @given(st.integers(0, 2**31 - 1), st.sampled_from([2.2, 4.0, 7.0]))
 @settings(max_examples=30)
-def test_no_wall_that_could_be_touched_is_missing(seed, cell_m):
-    """Every wall within reach of a robot in a free cell is among the boxes, and every box is on a wall."""
+def test_boxes_cover_all_walls_within_reach(seed, cell_m):
+    """For robots in free cells, all walls within reach have a box, and all boxes are on walls."""
     walls = random_walls(seed, height=12, width=12, density=0.6)
     maze = make_maze(walls, cell_m=cell_m)
     rng = np.random.default_rng(seed)
@@ -212,11 +212,11 @@ def test_no_wall_that_could_be_touched_is_missing(seed, cell_m):
     assert (boxes[..., 2][boxes[..., 2] <= 0] < -100).all()
 
 
-def test_moved_boxes_equal_a_model_with_every_wall_built_in(engine, wall_distance):
-    """One step each from the same state, along random drives by the walls; and then the drives as a whole.
+def test_moved_boxes_equal_model_with_all_walls(engine, wall_distance):
+    """Single steps from the same states, along random drives near walls; then whole drives.
 
-    A step differs by the rounding of its state to float32, 4e-6 m at 40 m. Drives part where a robot meets a
-    corner head on: there alone a rounding decides.
+    A step differs by the rounding of its state to float32 (4e-6 m at 40 m). Whole drives may differ only where a robot
+    hits a corner head-on, because rounding decides the side.
     """
     length, substeps = 300, engine("mujoco").n_substeps
     model = static_model(POINT, LARGE.tobytes(), *LARGE.shape)
@@ -245,8 +245,8 @@ def test_moved_boxes_equal_a_model_with_every_wall_built_in(engine, wall_distanc
 
 
 @pytest.mark.parametrize("name", ["antmaze-large", "hall", "unseen-rooms"])
-def test_no_speed_carries_the_point_through_a_wall(engine, wall_distance, name):
-    """Full throttle along both axes, from starts by the walls and at top speed: walls give by centimetres."""
+def test_point_never_passes_through_wall(engine, wall_distance, name):
+    """Full throttle along both axes, from starts near walls at top speed. Walls yield by centimetres."""
     walls = load_walls(name)
     maze = load_maze(name)
     diagonal = jnp.array([[1, 1], [1, -1], [-1, 1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]], jnp.float32)
@@ -255,13 +255,13 @@ def test_no_speed_carries_the_point_through_a_wall(engine, wall_distance, name):
         direction = diagonal[np.random.default_rng(seed).integers(len(diagonal), size=N)]
         after = drive(engine("mujoco"), maze, state, jnp.broadcast_to(direction, (60, N, 2)))
         position = np.concatenate([np.asarray(state.qpos)[None], np.asarray(after.qpos)])
-        assert wall_distance(walls, position).min() > 0.35  # so the centre is never inside one
+        assert wall_distance(walls, position).min() > 0.35  # so the centre is never inside a wall
         moved = np.linalg.norm(np.diff(position, axis=0), axis=-1)
         assert moved.max() <= POINT.top_speed_mps * POINT.control_dt_s + 1e-4
         assert (wall_distance(walls, position[-1]) < 0.52).mean() > 0.5  # the walls were reached
 
 
-def test_cells_too_small_for_three_boxes_are_refused():
+def test_too_small_cells_are_error():
     for robot in (POINT, dataclasses.replace(POINT, touch_m=0.53), dataclasses.replace(POINT, top_speed_mps=9.1)):
         least = 2 * (robot.touch_m + robot.top_speed_mps * robot.control_dt_s)
         with pytest.raises(UserError) as refusal:
@@ -270,10 +270,10 @@ def test_cells_too_small_for_three_boxes_are_refused():
         assert robot.name in message and "\n" not in message
         enough = float(message.split("at least ")[1].removesuffix(" m"))
         assert least <= enough + 1e-9 and enough < least + 0.11
-        build_model(robot, cell_m=enough)  # the mend is a mend
+        build_model(robot, cell_m=enough)  # the suggested size works
 
 
-def test_the_point_is_what_its_data_say():
+def test_model_of_point_matches_its_data():
     model = mujoco.MjModel.from_xml_string(model_xml(POINT))
     assert model.geom("ball").size[0] == POINT.radius_m == POINT.touch_m
     data = mujoco.MjData(model)

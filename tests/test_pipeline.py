@@ -1,4 +1,4 @@
-"""The pipeline: a run's folder, and that whatever stops it, the next one goes on as if nothing had."""
+"""The pipeline: the folder of a run, and resuming after any interruption."""
 
 import contextlib
 import dataclasses
@@ -60,7 +60,7 @@ def times(folder):
 # ---------------------------------------------------------------------------------------------------- a whole run
 
 
-def test_a_run_leaves_everything_behind(tiny_run):
+def test_run_writes_all_files(tiny_run):
     folder = tiny_run.folder
     for stage in STAGES:
         assert read_json(folder / stage / "done.json")["wall_s"] >= 0
@@ -73,7 +73,7 @@ def test_a_run_leaves_everything_behind(tiny_run):
     assert {line["stage"] for line in lines} == {"controller", "value", "fit", "value-1", "fit-1"}
 
 
-def test_the_config_says_what_the_run_is_of(tiny_run, tiny_settings):
+def test_config_describes_run(tiny_run, tiny_settings):
     config = read_json(tiny_run.folder / "config.json")
     assert (config["robot"], config["preset"], config["seed"], config["engine"]) == ("point", "tiny", 0, "auto")
     assert list(config["mazes"]) == ["islands"] and list(config["eval_mazes"]) == ["antmaze-umaze"]
@@ -83,7 +83,7 @@ def test_the_config_says_what_the_run_is_of(tiny_run, tiny_settings):
     assert config["hardware"] and config["commit"] and config["command"] and config["created"].startswith("20")
 
 
-def test_every_method_meets_the_same_pairs_in_every_maze(tiny_run):
+def test_all_methods_have_same_pairs(tiny_run):
     rows = pipeline.results(tiny_run.folder)
     places = [("islands", True), ("antmaze-umaze", False)]
     assert [(row["maze"], row["seen"], row["method"]) for row in rows] == [(*p, m) for p in places for m in METHODS]
@@ -94,22 +94,22 @@ def test_every_method_meets_the_same_pairs_in_every_maze(tiny_run):
     assert all(np.isfinite(row["spl"]) for row in rows)
 
 
-def test_start_and_goal_are_in_one_region(tiny_run):
+def test_start_and_goal_are_in_same_region(tiny_run):
     pairs = read_json(next((tiny_run.folder / "evaluate").glob("pairs-islands-*.json")))
     side = [np.array(pairs[name])[:, 0] < 18.0 for name in ("start", "goal")]  # the wall is 16 m to 20 m from the left
     assert (side[0] == side[1]).all()
 
 
-def test_the_model_is_read_back_as_it_was_made(tiny_run, tiny_settings):
+def test_model_round_trip_is_identity(tiny_run, tiny_settings):
     model = load_model(str(tiny_run.folder))
     assert (model.robot, model.settings, model.made["seed"]) == ("point", tiny_settings, 0)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((model.policy, model.controller)))
 
 
-def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(tiny_settings, tmp_path):
+def test_random_mazes_are_in_data_but_not_in_evaluation(tiny_settings, tmp_path):
     collecting = dataclasses.replace(tiny_settings.collect, trajectories=6, reset_interval=2)
     settings = dataclasses.replace(tiny_settings, controller="zoo", random_mazes=3, collect=collecting, rounds=0)
-    run = make_run(tmp_path / "run", settings)  # a trained controller arrives in every maze
+    run = make_run(tmp_path / "run", settings)  # a trained controller succeeds in every maze
     pipeline.train(run)
     data = storage.load(run.folder / "collect" / "trajectories.npz")
     assert set(data.maze.tolist()) > {0} and data.maze.max() <= 3
@@ -120,7 +120,7 @@ def test_data_are_of_the_random_mazes_too_and_an_evaluation_of_the_named_ones(ti
     assert {row["maze"] for row in pipeline.results(run.folder)} == {"antmaze-umaze"}
 
 
-def test_failures_are_looked_for_in_other_mazes_than_the_plans_are_of(tiny_settings, tmp_path):
+def test_recoveries_come_from_random_mazes(tiny_settings, tmp_path):
     collecting = dataclasses.replace(tiny_settings.collect, reset_interval=2)
     recovering = dataclasses.replace(tiny_settings.recover, random_mazes=3, keep="relabelled")
     settings = dataclasses.replace(tiny_settings, controller="zoo", collect=collecting, recover=recovering)
@@ -137,7 +137,7 @@ def test_failures_are_looked_for_in_other_mazes_than_the_plans_are_of(tiny_setti
 
 
 @pytest.mark.rank_promotion("allow")  # brax's running statistics
-def test_a_skill_stays_the_runs_controller_through_all_rounds(tiny_settings, tmp_path):
+def test_skill_head_equals_controller_after_all_rounds(tiny_settings, tmp_path):
     model = dataclasses.replace(tiny_settings.model, skill=True)
     run = make_run(tmp_path / "run", dataclasses.replace(tiny_settings, model=model))
     pipeline.train(run)
@@ -149,8 +149,8 @@ def test_a_skill_stays_the_runs_controller_through_all_rounds(tiny_settings, tmp
     assert "predict_action" not in trained.policy.params["params"]
 
 
-def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, tmp_path):
-    """Whatever comes to lie where it came from."""
+def test_run_keeps_copy_of_given_controller(tiny_run, tiny_settings, tmp_path):
+    """Later changes at the source do not affect the run."""
     source = tmp_path / "source"
     shutil.copytree(tiny_run.folder / "controller", source / "controller")
     settings = dataclasses.replace(tiny_settings, controller=str(source), controller_action_scale=0.5)
@@ -165,8 +165,8 @@ def test_a_run_keeps_the_controller_that_it_was_given(tiny_run, tiny_settings, t
     assert given.action_scale == config.action_scale == 0.5 * tiny_settings.sac.action_scale
 
 
-def test_the_random_mazes_are_always_the_same():
-    """A run's config names their number only."""
+def test_random_mazes_are_fixed():
+    """The config of a run contains only their number."""
     few, many = random_mazes(2), random_mazes(4)
     assert all((a.walls == b.walls).all() for a, b in zip(few, many, strict=False))
     text = "".join(maze_text(maze) for maze in many)
@@ -177,7 +177,7 @@ def test_the_random_mazes_are_always_the_same():
 # ------------------------------------------------------------------------------------------------------- resuming
 
 
-def test_a_finished_run_is_not_run_again(tiny, tiny_run, tmp_path, monkeypatch):
+def test_finished_run_is_not_repeated(tiny, tiny_run, tmp_path, monkeypatch):
     folder = copy(tiny_run, tmp_path)
     before = times(folder)
     stages = [(pipeline, name) for name in ("collect", "fit", "recover", "evaluate")]
@@ -189,7 +189,7 @@ def test_a_finished_run_is_not_run_again(tiny, tiny_run, tmp_path, monkeypatch):
 
 
 def interrupt_in(monkeypatch, name, number):
-    """Sends a signal when the bar of that name moves for the first time."""
+    """Send a signal at the first update of the bar with this name."""
     update = Bar.update
 
     def moved(bar, done, note=""):
@@ -201,9 +201,9 @@ def interrupt_in(monkeypatch, name, number):
     monkeypatch.setattr(Bar, "update", moved)
 
 
-def test_an_interrupted_run_ends_like_one_that_was_not(tiny, tiny_run, tmp_path, monkeypatch, capsys):
-    """Stopped in the middle of every stage, by Ctrl-C and by SIGTERM: each time the rest is kept, and at the end
-    weights and results are those of the run that nothing stopped, to the last bit."""
+def test_interrupted_run_equals_uninterrupted_run(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+    """It is interrupted in all stages, by Ctrl-C and by SIGTERM. Finished work is kept, and the final weights and
+    results equal those of an uninterrupted run bit for bit."""
     folder = tmp_path / "stopped"
     command = [*tiny_run.arguments, "--out", str(folder), "--resume"]
     kept: dict[str, int] = {}
@@ -226,7 +226,7 @@ def test_an_interrupted_run_ends_like_one_that_was_not(tiny, tiny_run, tmp_path,
         assert ours | {"wall_s": 0} == whole | {"wall_s": 0}
 
 
-def test_a_signal_during_physics_waits_for_the_program(tiny, tiny_run, tmp_path, monkeypatch, capsys):
+def test_signal_during_physics_is_pending(tiny, tiny_run, tmp_path, monkeypatch, capsys):
     from ct_envs.physics import MujocoEngine
 
     step, calls = MujocoEngine._step, []
@@ -244,7 +244,7 @@ def test_a_signal_during_physics_waits_for_the_program(tiny, tiny_run, tmp_path,
     assert list((tmp_path / "run" / "controller" / "checkpoints-controller").glob("[0-9]*"))
 
 
-def test_time_adds_up_over_interruptions(tmp_path, tiny_settings, monkeypatch):
+def test_wall_time_includes_interrupted_attempts(tmp_path, tiny_settings, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(runs.time, "perf_counter", lambda: now[0])
     run = make_run(tmp_path, tiny_settings)
@@ -262,7 +262,7 @@ def test_time_adds_up_over_interruptions(tmp_path, tiny_settings, monkeypatch):
 # ------------------------------------------------------------------------------------------------- damaged folders
 
 
-def test_a_half_written_stage_is_run_again(tiny, tiny_run, tmp_path):
+def test_unfinished_stage_is_repeated(tiny, tiny_run, tmp_path):
     folder = copy(tiny_run, tmp_path)
     weights = (folder / WEIGHTS[0]).read_bytes()
     shutil.rmtree(folder / "model")
@@ -277,8 +277,8 @@ def test_a_half_written_stage_is_run_again(tiny, tiny_run, tmp_path):
 @pytest.mark.parametrize(
     "name", [*WEIGHTS, "controller/done.json", "fit/done.json", "collect/trajectories.npz", "model/model.json"]
 )
-def test_a_damaged_file_is_named_with_the_mend(name, tiny, tiny_run, tmp_path, capsys):
-    """Cut to half: one line says which file and what to delete, and deleting that mends it."""
+def test_damaged_file_is_named_with_remedy(name, tiny, tiny_run, tmp_path, capsys):
+    """The file is cut in half. The error names the file and what to delete; deleting it helps."""
     folder = copy(tiny_run, tmp_path)
     if not name.startswith("model/"):
         shutil.rmtree(folder / "model")
@@ -303,7 +303,7 @@ def test_a_damaged_file_is_named_with_the_mend(name, tiny, tiny_run, tmp_path, c
     ],
     ids=lambda changes: str(changes)[:30],
 )  # fmt: skip
-def test_pairs_that_are_none_are_named(changes, tmp_path, tiny_settings):
+def test_invalid_pairs_are_error(changes, tmp_path, tiny_settings):
     run = make_run(tmp_path, tiny_settings)
     (tmp_path / "evaluate").mkdir()
     pairs = {"start": [[1, 2]], "goal": [[1, 2]], "shortest_m": [1]} | changes
@@ -319,8 +319,8 @@ TRIAL = Trial("antmaze-umaze", None, None, {}, None, 1)  # pyright: ignore  # th
     "name", ["method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "steps_mean"]
 )
 @pytest.mark.parametrize("value", [None, [], {}, "x" * 3, [1], True])
-def test_rows_that_are_none_are_named(name, value, tiny_run, tmp_path, tiny_settings):
-    """A row left by an interrupted evaluation, and those of a finished one."""
+def test_invalid_rows_are_error(name, value, tiny_run, tmp_path, tiny_settings):
+    """The row of an interrupted evaluation, and the rows of a finished one."""
     rows = pipeline.results(tiny_run.folder)
     row = rows[0] | {name: value}
     if value is None:
@@ -338,9 +338,9 @@ def test_rows_that_are_none_are_named(name, value, tiny_run, tmp_path, tiny_sett
             pipeline.results(tmp_path)
 
 
-@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "target": 3}, {"maze": 9}])
-def test_trajectories_of_another_run_are_refused(changes, toy_data, tiny_run, tiny_settings, tmp_path):
-    """Of another robot, or of mazes that this run has not."""
+@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "label": 3}, {"maze": 9}])
+def test_trajectories_of_other_run_are_error(changes, toy_data, tiny_run, tiny_settings, tmp_path):
+    """Trajectories of another robot, or of mazes that do not belong to the run."""
     folder = copy(tiny_run, tmp_path)
     data = toy_data([3, 4])
     wider = {name: np.repeat(getattr(data, name)[..., :1], n, -1) for name, n in changes.items() if name != "maze"}
@@ -350,7 +350,7 @@ def test_trajectories_of_another_run_are_refused(changes, toy_data, tiny_run, ti
         pipeline.planning_trajectories(make_run(folder, tiny_settings), None)
 
 
-def test_a_config_without_its_provenance_is_named(tiny_run, tmp_path, tiny_settings):
+def test_config_without_provenance_is_error(tiny_run, tmp_path, tiny_settings):
     folder = copy(tiny_run, tmp_path)
     config = read_json(folder / "config.json")
     del config["commit"]
@@ -359,7 +359,7 @@ def test_a_config_without_its_provenance_is_named(tiny_run, tmp_path, tiny_setti
         _ = make_run(folder, tiny_settings).made
 
 
-def test_time_spent_that_is_no_number_is_named(tmp_path, tiny_settings):
+def test_invalid_wall_time_is_error(tmp_path, tiny_settings):
     run = make_run(tmp_path, tiny_settings)
     (tmp_path / "fit").mkdir()
     (tmp_path / "fit" / "spent.json").write_text('{"wall_s": "long"}')
@@ -383,7 +383,7 @@ def test_time_spent_that_is_no_number_is_named(tmp_path, tiny_settings):
         ({"eval_mazes": load_mazes(("antmaze-medium",))}, "eval_mazes"),
     ],
 )
-def test_a_run_goes_on_only_as_what_it_was_begun(changes, words, tmp_path, tiny_settings):
+def test_run_resumes_only_with_same_configuration(changes, words, tmp_path, tiny_settings):
     run = make_run(tmp_path / "run", tiny_settings)
     with open_run(run, resume=False):
         pass
@@ -399,7 +399,7 @@ def test_a_run_goes_on_only_as_what_it_was_begun(changes, words, tmp_path, tiny_
         pass
 
 
-def test_two_processes_do_not_work_in_one_folder(tmp_path, tiny_settings):
+def test_run_folder_is_locked(tmp_path, tiny_settings):
     run = make_run(tmp_path / "run", tiny_settings)
     with open_run(run, resume=True):
         code = f"import fcntl; fcntl.flock(open({str(run.folder / 'run.lock')!r}), fcntl.LOCK_EX | fcntl.LOCK_NB)"
@@ -409,7 +409,7 @@ def test_two_processes_do_not_work_in_one_folder(tmp_path, tiny_settings):
             pass
 
 
-def test_mazes_of_one_name_are_told_apart_or_refused(tmp_path):
+def test_different_mazes_with_same_name_are_error(tmp_path):
     for folder, text in (("a", "####\n#..#\n####"), ("b", "#####\n#...#\n#####")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "floor.txt").write_text(text)
@@ -426,7 +426,7 @@ def test_mazes_of_one_name_are_told_apart_or_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, monkeypatch, islands):
+def test_all_stages_run_without_jit(jit_disabled, tmp_path, tiny_settings, monkeypatch, islands):
     spec = dataclasses.replace(robots.POINT, horizon=2, goal_tolerance_m=1.5)
     monkeypatch.setitem(robots.ROBOTS, "point", spec)
     change = dataclasses.replace
@@ -436,7 +436,7 @@ def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, mon
         prm=change(tiny_settings.prm, samples=12),
         sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
         collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
-        rounds=0,  # a second fit; recoveries are tested so on their own
+        rounds=0,  # a round would be a second fit; recoveries have their own test without jit
         fit=fit,
         value=change(tiny_settings.value, fit=change(fit, steps=1)),
         episodes=2,
@@ -452,7 +452,7 @@ def test_every_stage_runs_without_jit(jit_disabled, tmp_path, tiny_settings, mon
     assert [row["method"] for row in pipeline.results(run.folder)] == ["ct"]
 
 
-def test_only_a_change_of_what_is_no_result_makes_a_commit_dirty(tmp_path, monkeypatch):
+def test_changed_results_do_not_make_commit_dirty(tmp_path, monkeypatch):
     def git(*arguments):
         who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
         return subprocess.run(

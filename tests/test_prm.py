@@ -1,4 +1,4 @@
-"""Roadmaps: their edges are the free ones, the table holds shortest paths, plans are free, guides arrive."""
+"""Roadmaps: edges and plans are free, the table has shortest paths, and guides lead to the goal."""
 
 import functools
 from typing import NamedTuple
@@ -47,7 +47,7 @@ def two_rooms():
 
 
 def segment_clearances(wall_distance, walls, a, b) -> np.ndarray:
-    """Distance [m] from segments to the nearest wall, sampled: at most 2 cm more than it is."""
+    """Distance [m] from segments to the nearest wall, computed at samples; at most 2 cm too large."""
     share = np.linspace(0, 1, 301)[:, None, None]
     return wall_distance(walls, a + share * (b - a)).min(0)
 
@@ -66,7 +66,7 @@ def corners(walls: np.ndarray, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("walls", [HALL, COILS], ids=["an empty hall", "a maze of 33 x 33 cells"])
-def test_a_roadmap_grows_until_it_joins_starts_and_goals(walls):
+def test_roadmap_grows_until_starts_and_goals_are_connected(walls):
     maze, ends = make_maze(walls), corners(walls, 12)
     few = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, config=PrmConfig(most_samples=200))
     assert few.samples == 200 and not joins(few, ends).all()
@@ -74,10 +74,10 @@ def test_a_roadmap_grows_until_it_joins_starts_and_goals(walls):
     assert joins(grown, ends).all()
     np.testing.assert_array_equal(grown.points[:200], few.points)
     halved = build_roadmap(jax.random.key(0), maze, radius_m=RADIUS, config=PrmConfig(most_samples=grown.samples // 2))
-    assert not joins(halved, ends).all()  # so many were needed
+    assert not joins(halved, ends).all()  # half as many samples are not enough
 
 
-def test_a_roadmap_without_starts_and_goals_joins_most_of_its_own_points():
+def test_roadmap_without_pairs_connects_most_points():
     roadmap = build_roadmap(jax.random.key(0), make_maze(HALL), radius_m=RADIUS)
     largest = max(nx.connected_components(roadmap.graph), key=len)
     assert len(largest) ** 2 >= 0.4 * len(roadmap.points) ** 2
@@ -85,18 +85,18 @@ def test_a_roadmap_without_starts_and_goals_joins_most_of_its_own_points():
 
 @pytest.mark.parametrize("name", ["antmaze-large", "antmaze-large-eval", "hall"])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_published_number_suffices_in_the_published_mazes(name, seed):
+def test_published_number_of_samples_suffices_in_published_mazes(name, seed):
     assert roadmap_of(name, PrmConfig(), seed).samples == 200
 
 
-def test_what_lies_apart_asks_for_no_more_points():
-    ends = np.array([[[6.0, 6.0], [30.0, 6.0]]])  # in one room and in the other
+def test_separate_regions_do_not_need_more_points():
+    ends = np.array([[[6.0, 6.0], [30.0, 6.0]]])  # in different rooms
     roadmap = build_roadmap(jax.random.key(0), make_maze(TWO_ROOMS), radius_m=RADIUS, config=PrmConfig(60), ends=ends)
     assert roadmap.samples == 60 and not joins(roadmap, ends).any()
 
 
 @pytest.mark.parametrize("roadmap", [two_rooms, lambda: roadmap_of("antmaze-large", PrmConfig(samples=40))])
-def test_pairs_that_a_roadmap_joins_are_drawn_evenly(roadmap):
+def test_connected_pairs_are_drawn_uniformly(roadmap):
     roadmap = roadmap()
     pairs = draw_joined(jax.random.key(3), roadmap, 60_000)
     possible = {(i, j) for part in nx.connected_components(roadmap.graph) for i in part for j in part if i != j}
@@ -105,7 +105,7 @@ def test_pairs_that_a_roadmap_joins_are_drawn_evenly(roadmap):
     assert stats.chisquare(count).pvalue > 1e-4
 
 
-def test_a_large_roadmap_has_a_table_of_its_goals_alone():
+def test_large_roadmap_has_table_of_its_goals_only():
     roadmap = build_roadmap(
         jax.random.key(0), make_maze(HALL), radius_m=RADIUS, config=PrmConfig(samples=2100, connect_m=6.0)
     )
@@ -130,7 +130,7 @@ def test_a_large_roadmap_has_a_table_of_its_goals_alone():
 
 @given(SEEDS, st.sampled_from([0.0, 0.4]))
 @settings(max_examples=5)
-def test_edges_are_just_the_pairs_within_reach_with_a_free_way(wall_distance, seed, margin_m):
+def test_edges_are_exactly_the_free_pairs_within_reach(wall_distance, seed, margin_m):
     walls = random_walls(seed, density=0.8)
     config = PrmConfig(samples=50, connect_m=9.0, margin_m=margin_m, most_samples=50)
     roadmap = build_roadmap(jax.random.key(seed), make_maze(walls), radius_m=RADIUS, config=config)
@@ -150,7 +150,7 @@ def test_edges_are_just_the_pairs_within_reach_with_a_free_way(wall_distance, se
     assert joined[near][room > clear + 0.02].all()
 
 
-def test_the_graph_holds_the_edges_with_their_lengths():
+def test_graph_has_edges_with_lengths():
     roadmap = roadmap_of("antmaze-large")
     assert isinstance(roadmap.graph, nx.Graph) and not roadmap.graph.is_directed()
     assert list(roadmap.graph) == list(range(SMALL.samples))
@@ -160,8 +160,8 @@ def test_the_graph_holds_the_edges_with_their_lengths():
         assert roadmap.graph[i][j]["weight"] == roadmap.graph[j][i]["weight"] == pytest.approx(length, rel=1e-6)
 
 
-def test_points_are_uniform_over_the_free_area(wall_distance):
-    """Counts a quarter of a cell against the area that is clear in it."""
+def test_points_are_uniform_over_free_area(wall_distance):
+    """The number of points in each quarter of a cell matches its free area."""
     walls = load_walls("antmaze-umaze")
     config = PrmConfig(samples=4000, connect_m=0.01)
     points = build_roadmap(jax.random.key(0), make_maze(walls), radius_m=RADIUS, config=config).points
@@ -175,7 +175,7 @@ def test_points_are_uniform_over_the_free_area(wall_distance):
     assert stats.chisquare(counted[area > 0], expected).pvalue > 1e-4
 
 
-def test_a_key_gives_one_roadmap():
+def test_roadmap_is_deterministic():
     one, again, other = (
         build_roadmap(jax.random.key(seed), load_maze("antmaze-large"), radius_m=RADIUS, config=SMALL)
         for seed in (3, 3, 4)
@@ -185,7 +185,7 @@ def test_a_key_gives_one_roadmap():
     assert (one.points != other.points).any()
 
 
-def test_extended_roadmaps_keep_what_they_have(wall_distance):
+def test_extension_keeps_points_and_edges(wall_distance):
     roadmap = roadmap_of("antmaze-large", PrmConfig(samples=60, margin_m=0.5))
     further = roadmap_of("antmaze-large", PrmConfig(samples=60), seed=9).points[:5]
     grown = extend(roadmap, further)
@@ -200,7 +200,7 @@ def test_extended_roadmaps_keep_what_they_have(wall_distance):
     assert (room >= RADIUS - 1e-4).all()
 
 
-def test_a_maze_too_narrow_for_the_robot_is_refused():
+def test_too_narrow_maze_is_error():
     with pytest.raises(UserError, match="larger cells") as refusal:
         build_roadmap(jax.random.key(0), load_maze("antmaze-umaze", cell_m=0.9), radius_m=RADIUS, config=SMALL)
     assert "0.5 m" in str(refusal.value) and "\n" not in str(refusal.value)
@@ -210,8 +210,8 @@ def test_a_maze_too_narrow_for_the_robot_is_refused():
 
 
 @pytest.mark.parametrize(("samples", "connect_m", "pieces"), [(200, 10.0, False), (60, 6.0, True), (60, 2.0, True)])
-def test_the_table_holds_shortest_paths(samples, connect_m, pieces):
-    """Against networkx."""
+def test_table_has_shortest_paths(samples, connect_m, pieces):
+    """Compared with networkx."""
     roadmap = roadmap_of("antmaze-large", PrmConfig(samples=samples, connect_m=connect_m))
     table, n = roadmap.table, len(roadmap.points)
     expected = np.full((n, n), np.inf)
@@ -244,7 +244,7 @@ def test_a_roadmap_without_edges_has_no_paths():
 
 @given(SEEDS)
 @settings(max_examples=15)
-def test_plans_join_any_two_free_points(wall_distance, seed):
+def test_plans_connect_any_two_free_points(wall_distance, seed):
     walls, roadmap = load_walls("antmaze-large"), roadmap_of("antmaze-large", PrmConfig())
     rng = np.random.default_rng(seed)
     free = np.argwhere(~walls)[:, ::-1]
@@ -260,7 +260,7 @@ def test_plans_join_any_two_free_points(wall_distance, seed):
     assert (room >= RADIUS - 1e-4).all()
 
 
-def test_a_plan_between_points_of_the_roadmap_is_the_tables():
+def test_plan_between_points_of_roadmap_equals_table():
     roadmap = roadmap_of("antmaze-large")
     answers = set()
     for i, j in [(0, 1), (5, 40), (12, 33), (7, 7), (2, 50), (3, 20)]:
@@ -268,10 +268,10 @@ def test_a_plan_between_points_of_the_roadmap_is_the_tables():
         length = path.length_m if isinstance(path, Path) else np.inf
         assert length == pytest.approx(float(roadmap.table.distance[i, j]), rel=1e-5, abs=1e-5)
         answers.add(type(path))
-    assert answers == {Path, NoPath}  # a small roadmap is of several pieces
+    assert answers == {Path, NoPath}  # a small roadmap has several components
 
 
-def test_there_is_no_path_between_rooms_that_nothing_joins():
+def test_separate_rooms_have_no_path():
     roadmap = two_rooms()
     answer = roadmap.plan(np.array([6.0, 6.0]), np.array([26.0, 6.0]))
     assert isinstance(answer, NoPath)
@@ -282,7 +282,7 @@ def test_there_is_no_path_between_rooms_that_nothing_joins():
 
 
 @pytest.mark.parametrize("bad", [(18.0, 6.0), (4.2, 6.0), (-9.0, 6.0), (1e9, 6.0), (float("nan"), 6.0)])
-def test_there_is_no_path_from_or_to_a_wall(bad):
+def test_points_in_walls_have_no_path(bad):
     roadmap, good = two_rooms(), (6.0, 6.0)
     for name, ends in (("start", (bad, good)), ("goal", (good, bad))):
         answer = roadmap.plan(*map(np.array, ends))
@@ -322,7 +322,7 @@ class Plans(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("guide", "length"))
 def walk(guide, plan, maze, start, goal, key, noise, length):
-    """Positions [T, N, 2] of dummies that move 0.3 m to where the guide says, and ``noise`` [m] anywhere."""
+    """Positions [T, N, 2] of dummies that move 0.3 m towards their waypoints, plus random ``noise`` [m]."""
 
     def once(carry, key):
         position, plan = carry
@@ -340,7 +340,7 @@ OWN_AND_OTHER = [(PrmConfig(), 0), (SMALL, 5)]
 
 
 def guided(guide: RoadmapGuide, ends: np.ndarray, *, noise: float, length: int = 500) -> np.ndarray:
-    """Paths [T, N, 2] of dummies led from the first to the second of ``ends`` [N, 2, 2]."""
+    """Paths [T, N, 2] of dummies that are guided from the first to the second of ``ends`` [N, 2, 2]."""
     start, goal = jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1])
     maze = jax.tree.map(lambda leaf: leaf[WHICH], stack_mazes([load_maze(name) for name in NAMES]))
     tables = stack_tables([roadmap_of(name, PrmConfig()).table for name in NAMES])
@@ -349,7 +349,7 @@ def guided(guide: RoadmapGuide, ends: np.ndarray, *, noise: float, length: int =
 
 
 @pytest.mark.parametrize("shortcut", [False, True])
-def test_a_table_of_some_goals_filled_up_to_a_larger_one_leads_as_the_whole_table(shortcut):
+def test_padded_table_of_some_goals_guides_like_full_table(shortcut):
     maze, small = load_maze(NAMES[0]), roadmap_of(NAMES[0], PrmConfig())
     ends = small.points[[[3, 40], [7, 90]]]
     columns = np.unique([40, 90])
@@ -368,8 +368,8 @@ def test_a_table_of_some_goals_filled_up_to_a_larger_one_leads_as_the_whole_tabl
 
 
 @pytest.mark.parametrize("shortcut", [False, True])
-def test_guides_lead_to_the_goal_by_the_plan(wall_distance, shortcut):
-    """Two mazes and roadmaps at once; starts and goals are points of the roadmap, or of another."""
+def test_guides_follow_plan_to_goal(wall_distance, shortcut):
+    """For two mazes and roadmaps. Starts and goals are points of this roadmap, or of another one."""
     on, off = ([roadmap_of(name, config, seed).points for name in NAMES] for config, seed in OWN_AND_OTHER)
     ends = np.stack([(on if i < 12 else off)[which][[i, i + 20]] for i, which in enumerate(WHICH)])
     path = guided(RoadmapGuide(RADIUS, shortcut=shortcut), ends, noise=0.0)
@@ -383,15 +383,15 @@ def test_guides_lead_to_the_goal_by_the_plan(wall_distance, shortcut):
 
 
 def test_guides_recover_from_disturbances():
-    """Pushed 0.1 m at random at every step, now and then out of sight of the waypoint, and still arriving."""
+    """Each step has a random push of 0.1 m, sometimes out of sight of the waypoint; the goals are still reached."""
     ends = np.stack([roadmap_of(NAMES[which], PrmConfig()).points[[i, i + 30]] for i, which in enumerate(WHICH)])
     path = guided(RoadmapGuide(RADIUS), ends, noise=0.1)
     assert (np.linalg.norm(path - ends[None, :, 1], axis=-1).min(0) < 0.5).all()
 
 
 @pytest.mark.parametrize("density", [1.0, 2.0, 2.5])
-def test_a_cluttered_room_with_gaps_that_are_too_narrow_asks_for_no_more_points(density):
-    """The robot fits through the gaps, but not with its margin: more samples would never join what they part."""
+def test_narrow_gaps_do_not_need_more_points(density):
+    """The robot fits through the gaps, but not with its margin, so more samples cannot connect the two sides."""
     config = PrmConfig(samples=150, connect_m=2.0, margin_m=0.08)
     for seed in range(3):
         world = random_world(seed, 0.08 * density)

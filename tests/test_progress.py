@@ -1,4 +1,4 @@
-"""Progress and logs: what a person sees with and without a terminal, and files that stay readable."""
+"""Progress and logs: output with and without a terminal, and log files that stay readable."""
 
 import contextlib
 import io
@@ -14,7 +14,7 @@ from ct_jax.interrupts import interruptible
 from ct_jax.progress import Bar, Metrics
 
 
-def test_a_terminal_shows_a_bar_with_the_time_left():
+def test_terminal_shows_bar_with_remaining_time():
     screen = io.StringIO()
     with Bar("fit", 10, console=Console(file=screen, force_terminal=True, width=120)) as bar:
         for done in (1, 5, 10):
@@ -23,11 +23,11 @@ def test_a_terminal_shows_a_bar_with_the_time_left():
     assert "left" in screen.getvalue() and "loss 0.10" in screen.getvalue()
 
 
-def test_elsewhere_there_is_a_plain_line_now_and_then(monkeypatch, capsys):
+def test_without_terminal_lines_are_printed_at_intervals(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     with Bar("fit", 100) as bar:
-        for done in range(60, 101):  # resumed at 60: the 60 before took no time of this process
+        for done in range(60, 101):  # resumed at 60: the first 60 took no time in this process
             bar.update(done, "loss 0.5")
             now[0] += 1.0
     out, err = capsys.readouterr()
@@ -36,13 +36,13 @@ def test_elsewhere_there_is_a_plain_line_now_and_then(monkeypatch, capsys):
     assert lines == ["fit: 75/100, 25 s left loss 0.5", "fit: 90/100, 10 s left loss 0.5", "fit: done in 41 s"]
 
 
-def test_a_stopped_bar_does_not_say_done(capsys):
+def test_interrupted_bar_does_not_print_done(capsys):
     with pytest.raises(KeyboardInterrupt), Bar("fit", 10):
         raise KeyboardInterrupt
     assert "done" not in capsys.readouterr().err
 
 
-def test_a_bar_is_where_a_waiting_interrupt_comes_out():
+def test_bar_raises_pending_interrupt():
     import os
     import signal
 
@@ -56,10 +56,10 @@ def test_a_bar_is_where_a_waiting_interrupt_comes_out():
     with interruptible(), Bar("fit", 2) as bar:
         bar.update(1)
         echo = jax.jit(lambda x: jax.pure_callback(callback, jax.ShapeDtypeStruct((), np.float32), x))
-        assert float(echo(2.0)) == 2.0  # not an error of XLA
+        assert float(echo(2.0)) == 2.0  # the callback does not raise an error of XLA
         with pytest.raises(KeyboardInterrupt):
             bar.update(2)
-        bar.update(2)  # and only once
+        bar.update(2)  # it is raised only once
 
 
 def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
@@ -74,7 +74,7 @@ def test_metrics_are_json_lines_and_tensorboard_files(tmp_path):
     assert b"fit/loss" in events.read_bytes()
 
 
-def test_a_full_disk_is_an_error_and_no_hang(tmp_path):
+def test_full_disk_is_error_without_hang(tmp_path):
     metrics = Metrics(tmp_path)
     metrics._file.close()
     metrics._file = Path("/dev/full").open("wb")  # noqa: SIM115
@@ -84,7 +84,7 @@ def test_a_full_disk_is_an_error_and_no_hang(tmp_path):
         metrics.close()
 
 
-def test_metrics_go_on_after_a_half_line(tmp_path):
+def test_metrics_continue_after_incomplete_line(tmp_path):
     file = tmp_path / "metrics.jsonl"
     file.write_text('{"stage": "fit", "step": 1}\n{"stage": "fi')
     metrics = Metrics(tmp_path)

@@ -1,4 +1,4 @@
-"""MuJoCo does nothing unasked: no file, no word, and no way to draw is needed to step."""
+"""MuJoCo without side effects: it writes no file, prints nothing, and needs no OpenGL for physics."""
 
 import os
 import subprocess
@@ -42,33 +42,33 @@ def python(code: str, *arguments: str, cwd: Path, **variables: str) -> subproces
     )
 
 
-def test_warnings_go_to_a_logger_and_errors_stay(tmp_path):
+def test_warnings_go_to_logger_and_errors_are_raised(tmp_path):
     done = python(NAN, cwd=tmp_path)
     assert "bad" in done.stdout and done.stderr == ""
     assert "ct_envs.mujoco Nan, Inf or huge value in Q" in python(NAN, "log", cwd=tmp_path).stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_state_that_explodes_ends_the_episode_and_leaves_no_log(tmp_path):
+def test_diverged_state_writes_no_log_file(tmp_path):
     done = python(STEP, cwd=tmp_path)
     assert (done.stdout, done.stderr) == ("1.0 0.0\n", "")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_warning_handler_of_ones_own_stays(tmp_path):
+def test_existing_warning_handler_is_kept(tmp_path):
     code = "import mujoco; mujoco.set_mju_user_warning(print); import ct_envs.quiet"
     assert python(f"{code}; assert mujoco.get_mju_user_warning() is print", cwd=tmp_path).returncode == 0
 
 
 @pytest.mark.parametrize("value", ["nonsense", "osmesa", "egl", "glfw", "off", ""])
-def test_physics_does_not_ask_for_a_way_to_draw(value, tmp_path):
+def test_physics_does_not_need_opengl(value, tmp_path):
     code = "import os; from ct_envs import MazeEnv; MazeEnv('point'); print(*map(os.environ.get, ('MUJOCO_GL', 'X')))"
     done = python(code, cwd=tmp_path, MUJOCO_GL=value)
     assert done.stdout == f"{value} None\n", done.stderr
 
 
 @pytest.mark.parametrize("first", ["", "import ct_envs.quiet;"])
-def test_what_mujoco_draws_with_is_there_as_it_would_be(first, tmp_path):
+def test_opengl_backend_of_mujoco_is_kept(first, tmp_path):
     code = "import os, mujoco; print(getattr(mujoco, 'GLContext', None), os.environ.get('PYOPENGL_PLATFORM'))"
     assert (
         python(first + code, cwd=tmp_path, MUJOCO_GL="egl").stdout == python(code, cwd=tmp_path, MUJOCO_GL="egl").stdout

@@ -1,7 +1,8 @@
-"""A random key is used once: split, or drawn from, or handed on; or else folded, as often as one likes, and no more.
+"""A random key is used once: it is split, or drawn from, or passed on. A key can be folded several times, but then it
+is not used otherwise.
 
-With jax's partitionable generator ``fold_in(key, i)`` is ``split(key, n)[i]``, so a key that is folded and also split
-gives two things the same randomness.
+With jax's partitionable generator, ``fold_in(key, i)`` equals ``split(key, n)[i]``. A key that is folded and also split
+would give the same randomness twice.
 """
 
 import ast
@@ -19,8 +20,8 @@ SOURCES = sorted(
 _LOOKS = {"key_data", "len", "isinstance", "shape", "wrap_key_data", "sorted"}  # calls that use no randomness
 
 
-def test_folding_is_splitting():
-    """Why the rule is there."""
+def test_fold_in_equals_split():
+    """The reason for the rule."""
     key = jax.random.key(0)
     for i in range(3):
         split, folded = jax.random.split(key, 3)[i], jax.random.fold_in(key, i)
@@ -28,7 +29,7 @@ def test_folding_is_splitting():
 
 
 def reuses(source: str) -> list[str]:
-    """The keys that a function of the source uses twice, with their lines."""
+    """The keys that functions of a source use twice, with their lines."""
     found = []
     for function in ast.walk(ast.parse(source)):
         if isinstance(function, ast.FunctionDef):
@@ -37,7 +38,7 @@ def reuses(source: str) -> list[str]:
 
 
 class _Uses(ast.NodeVisitor):
-    """The uses of each key in a function, in the order of the program; nested functions belong to it."""
+    """The uses of each key in a function and its nested functions, in the order of the program."""
 
     def __init__(self) -> None:
         self.uses: dict[str, list[str]] = defaultdict(list)
@@ -49,7 +50,7 @@ class _Uses(ast.NodeVisitor):
         return self.found
 
     def visit_If(self, node: ast.If) -> None:
-        """Of two branches one is taken; one that returns leaves nothing behind."""
+        """Only one of two branches is taken. After a branch that returns, its uses do not count."""
         self.visit(node.test)
         before, after = self.uses, []
         for branch in (node.body, node.orelse):
@@ -68,7 +69,7 @@ class _Uses(ast.NodeVisitor):
                     self.uses.pop(ast.unparse(part), None)
 
     def _visit_inner(self, node: ast.FunctionDef | ast.Lambda) -> None:
-        """Its arguments are other things than what bears their names outside."""
+        """The arguments of a lambda are different from outer variables with the same names."""
         names = [argument.arg for argument in [*node.args.args, *node.args.kwonlyargs]]
         outside = {name: self.uses.pop(name) for name in names if name in self.uses}
         self.generic_visit(node)
@@ -81,7 +82,7 @@ class _Uses(ast.NodeVisitor):
     def visit_Call(self, node: ast.Call) -> None:
         self.generic_visit(node)
         how = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        if how in _LOOKS or how[:1].isupper():  # a class that keeps the key for later uses no randomness
+        if how in _LOOKS or how[:1].isupper():  # a class that stores the key does not use it yet
             return
         for argument in [*node.args, *(keyword.value for keyword in node.keywords)]:
             name = ast.unparse(argument)
@@ -104,11 +105,11 @@ class _Uses(ast.NodeVisitor):
         ("return uniform(keys[0]), [draw(test_key), fold_in(test_key, 0)]", 1),
     ],
 )
-def test_the_rule_finds_what_it_should(body, wrong):
+def test_rule_finds_reused_keys(body, wrong):
     assert len(reuses(f"def f(key, test_key, state, a):\n {body}")) == wrong
 
 
-# The same randomness twice, on purpose.
+# These use the same randomness twice on purpose.
 _ON_PURPOSE = {
     "policy_key": "temperature and policy are judged by the same actions, which XLA then computes once",
     "test_key": "every test of a controller in training is the same test",
@@ -116,6 +117,6 @@ _ON_PURPOSE = {
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda file: str(file.relative_to(ROOT)))
-def test_no_key_is_used_twice(file):
+def test_keys_are_used_once(file):
     found = reuses(file.read_text("utf-8"))
     assert [use for use in found if not any(f" {name} goes" in use for name in _ON_PURPOSE)] == []

@@ -1,4 +1,4 @@
-"""The report: whole and self-contained, complete in what it lists, and calm about whatever a run folder lacks."""
+"""The report: it is self-contained and complete, and tolerates missing or damaged parts of a run folder."""
 
 import json
 import re
@@ -27,7 +27,7 @@ VOID = {"meta", "link", "img", "br", "hr", "input", "image", "use"}
 
 
 class Page(HTMLParser):
-    """Reads a page: its tags, its text, and whether its tags nest."""
+    """A parser of pages: tags, text, and whether the tags are nested correctly."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -57,7 +57,7 @@ class Page(HTMLParser):
 
 
 def make_episodes(seed: int, *, failures: int, n: int = 6) -> dict[str, np.ndarray]:
-    """Episodes of which the first ``failures`` stay where they are, and the others reach their goal half-way."""
+    """Episodes: the first ``failures`` do not move, and the others reach their goal after half of the horizon."""
     rng = np.random.default_rng(seed)
     start, goal = rng.uniform(4, 16, (2, n, 2)).astype(np.float32)
     success = np.arange(n) >= failures
@@ -80,18 +80,18 @@ def make_row(maze: str, method: str, success_rate: float, n: int = 6) -> dict:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The text and the page of a run with all there is."""
+    """The text and the page of a complete run."""
     return read(write_run(tmp_path_factory.mktemp("whole"), failures=(2, 5), methods=METHODS))
 
 
 @pytest.fixture
 def make_run(tmp_path):
-    """Writes a small run folder."""
+    """Write a small run folder."""
     return lambda **how: write_run(tmp_path, **how)
 
 
 def write_run(folder, *, failures=(0, 1), unseen=UNSEEN, methods=("ct",), n=6):
-    """Writes a run folder; ``failures`` are the transformer's in the seen and in the unseen maze."""
+    """Write a run folder. ``failures`` are those of the transformer in the seen and in the unseen maze."""
     mazes = {SEEN: "antmaze-umaze", unseen: "antmaze-medium"}
     texts = {name: draw_walls(load_walls(file)) for name, file in mazes.items()}
     config = {"robot": "point", "preset": "demo", "seed": 7, "command": "ct-jax train point", "commit": "abc"}
@@ -140,12 +140,12 @@ def path_figures(text: str) -> list[str]:
 
 
 def crosses(figure: str) -> int:
-    """How many failures a drawing marks."""
+    """The number of failures that a drawing marks."""
     return sum(g.count("<use") for g in figure.split("<defs>") if "fill: var(--fail)" in g)
 
 
 def assert_whole(text: str) -> Page:
-    """A page whose tags nest, and all of which are closed."""
+    """Parse a page, and check that its tags are nested and closed correctly."""
     page = Page(text)
     assert page.nested and not page.open
     return page
@@ -154,7 +154,7 @@ def assert_whole(text: str) -> Page:
 # ---------------------------------------------------------------------------------------------- a whole run
 
 
-def test_nothing_comes_from_outside(whole):
+def test_page_loads_nothing(whole):
     text, page = whole
     links = [(k, v) for _, attrs in page.tags for k, v in attrs.items() if k in ("src", "href", "xlink:href", "srcset")]
     assert links and all(link.startswith(("#", "data:")) for _, link in links)
@@ -162,7 +162,7 @@ def test_nothing_comes_from_outside(whole):
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
 
 
-def test_every_reference_within_the_page_is_defined_once(whole):
+def test_references_in_page_are_defined_once(whole):
     _, page = whole
     defined = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
     used = {v[1:] for _, attrs in page.tags for k, v in attrs.items() if k == "xlink:href"}
@@ -171,7 +171,7 @@ def test_every_reference_within_the_page_is_defined_once(whole):
     assert len(defined) == len(set(defined))
 
 
-def test_pictures_have_words_and_colours_follow_the_theme(whole):
+def test_pictures_have_descriptions_and_theme_colours(whole):
     text, page = whole
     shown = [attrs for tag, attrs in page.tags if tag == "svg" and "aria-hidden" not in attrs]
     assert len(shown) > 10
@@ -182,7 +182,7 @@ def test_pictures_have_words_and_colours_follow_the_theme(whole):
     assert used - {"low", "at", "high", "share"} <= declared[0] & declared[1]
 
 
-def test_the_table_has_every_method_of_every_maze(whole):
+def test_table_has_all_methods_and_mazes(whole):
     _, page = whole
     labels = [row.strip() for row in page.rows]
     for method in METHODS:
@@ -194,7 +194,7 @@ def test_the_table_has_every_method_of_every_maze(whole):
 
 
 @pytest.mark.parametrize(("rates", "shown"), [((0.0, 0.0), 0), ((0.0, 0.25), 1), ((None, None), 0), (("x", 0), 0)])
-def test_the_table_tells_of_divergence_only_where_there_was_some(make_run, rates, shown):
+def test_table_shows_divergence_only_if_it_occurred(make_run, rates, shown):
     run = make_run()
     rows = [make_row(name, "ct", 0.5) for name in (SEEN, UNSEEN)]
     rows = [row | ({} if rate is None else {"diverged_rate": rate}) for row, rate in zip(rows, rates, strict=True)]
@@ -203,20 +203,20 @@ def test_the_table_tells_of_divergence_only_where_there_was_some(make_run, rates
     assert text.count('<th scope="col">Diverged</th>') == 2 * shown
 
 
-def test_every_failure_is_listed_and_marked(whole):
+def test_all_failures_are_listed_and_marked(whole):
     text, page = whole
     assert len([row for row in page.rows if "stayed on one spot" in row]) == 7
     assert "2 failures: Control Transformer in antmaze-umaze" in page.text
     assert [crosses(figure) for figure in path_figures(text)] == [2, 5]
 
 
-def test_the_verdict_says_how_it_fails(whole):
+def test_verdict_describes_failures(whole):
     _, page = whole
     assert "reached 4 of 6 goals in the maze it was trained in and 1 of 6 in a maze it had never seen" in page.text
     assert "all 7 times it failed, it stayed on one spot" in page.text
 
 
-def test_a_run_without_failures_says_so(make_run):
+def test_run_without_failures(make_run):
     _, page = read(make_run(failures=(0, 0)))
     assert "did not fail once" in page.text
     assert "failures:" not in page.text
@@ -229,16 +229,16 @@ def test_random_mazes_are_mentioned(make_run, besides, said):
     config["settings"] |= {"random_mazes": besides, "recover": {"random_mazes": besides}}
     (run / "config.json").write_text(json.dumps(config))
     page = to_html(reading.read_run(run))
-    assert ("trained in 100 random mazes besides" in page) == said
-    assert ("looked for its failures in 100 random mazes" in page) == said
+    assert ("also trained in 100 random mazes" in page) == said
+    assert ("also collected in 100 random mazes" in page) == said
 
 
-def test_the_same_run_gives_the_same_page(make_run):
+def test_page_is_deterministic(make_run):
     run = make_run()
     assert read(run)[0] == read(run)[0]
 
 
-def test_a_large_run_stays_a_small_page(make_run):
+def test_page_of_large_run_is_small(make_run):
     run = make_run()
     rng = np.random.default_rng(0)
     n, steps = 200, 500
@@ -257,7 +257,7 @@ def everything(run):
 
 
 def strip(run):
-    """Leaves nothing but the configuration."""
+    """Delete everything except the configuration."""
     for file in everything(run):
         (run / file).unlink()
     return run
@@ -268,7 +268,7 @@ PARTS = ["evaluate/antmaze-medium-ct.npz", "evaluate/results.json", "metrics.jso
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("kept", [0.0, 0.6, None])
-def test_any_part_may_be_missing_or_torn(make_run, part, kept):
+def test_parts_can_be_missing_or_damaged(make_run, part, kept):
     run = make_run()
     assert set(PARTS) < set(everything(run))
     whole = (run / part).read_bytes()
@@ -278,14 +278,14 @@ def test_any_part_may_be_missing_or_torn(make_run, part, kept):
     assert_whole(to_html(reading.read_run(run)))
 
 
-def test_a_run_that_has_only_begun_says_what_is_missing(make_run):
+def test_page_of_new_run_lists_missing_files(make_run):
     _, page = read(strip(make_run()))
     for file in ("evaluate/results.json", "prm/roadmap.npz", "metrics.jsonl", "*/done.json"):
         assert file in page.text
     assert "ct-jax train point" in page.text
 
 
-def test_a_torn_line_of_metrics_is_left_out(make_run):
+def test_damaged_line_of_metrics_is_skipped(make_run):
     run = make_run()
     whole, _ = read(run)
     torn = '[]\n{"stage": "fit", "step": "x", "loss": 3}\n{"stage": "fit", "step": 5, "loss": NaN}\n{"stage": "fi'
@@ -304,14 +304,14 @@ def test_a_torn_line_of_metrics_is_left_out(make_run):
         {"rows": [3, {}, {"maze": 1, "method": None}, {"maze": "x" * 500, "method": "ct"}]},
     ],
 )
-def test_results_of_another_shape_are_no_results(make_run, value):
+def test_invalid_results_are_ignored(make_run, value):
     run = make_run()
     (run / "evaluate" / "results.json").write_text(json.dumps(value))
     assert_whole(to_html(reading.read_run(run)))
 
 
 @pytest.mark.parametrize("value", [None, [], 3, "text", {"a": None}, {"a": "not a maze"}])
-def test_a_config_of_another_shape_is_shown_as_far_as_it_goes(make_run, value):
+def test_invalid_config_entries_are_ignored(make_run, value):
     run = strip(make_run())
     for key in ("mazes", "eval_mazes", "settings", "versions", "command", "created", "robot", "cell_m"):
         (run / "config.json").write_text(json.dumps({key: value}))
@@ -320,7 +320,7 @@ def test_a_config_of_another_shape_is_shown_as_far_as_it_goes(make_run, value):
     read(run)
 
 
-def test_a_row_may_lack_figures(make_run):
+def test_rows_can_lack_numbers(make_run):
     run = make_run()
     rows = [{"maze": SEEN, "method": "ct"}, make_row(UNSEEN, "ct", float("nan"))]
     (run / "evaluate" / "results.json").write_text(json.dumps({"rows": rows}))
@@ -328,7 +328,7 @@ def test_a_row_may_lack_figures(make_run):
     assert sum(row.strip() == words.method_label("ct") for row in page.rows) == 2
 
 
-def test_a_number_too_large_is_no_figure(make_run):
+def test_too_large_number_is_ignored(make_run):
     run = make_run()
     rows = [make_row(SEEN, "ct", 0.5) | {"return_mean": 10**400, "steps_mean": 10**400}]
     (run / "evaluate" / "results.json").write_text(json.dumps({"rows": rows}))
@@ -336,8 +336,8 @@ def test_a_number_too_large_is_no_figure(make_run):
 
 
 @pytest.mark.parametrize("kind", ["U3", "c16", "f4"])
-def test_arrays_of_another_kind_or_shape_are_none(make_run, kind):
-    """Of the roadmap and of episodes, one after the other."""
+def test_invalid_arrays_are_ignored(make_run, kind):
+    """Arrays of the roadmap and of episodes, one at a time."""
     run = make_run()
     points, edges = np.zeros((3, 2)), np.array([[0, 1], [1, 2]])
     for name, changed in (("points", points.astype(kind)), ("edges", edges.astype(kind)), ("edges", np.arange(3))):
@@ -352,7 +352,7 @@ def test_arrays_of_another_kind_or_shape_are_none(make_run, kind):
     assert_whole(to_html(reading.read_run(run)))
 
 
-def test_broken_episodes_are_drawn_as_far_as_they_go(make_run):
+def test_damaged_episodes_are_drawn_partly(make_run):
     run = make_run()
     arrays = make_episodes(0, failures=6)
     arrays["path"][3:] = np.nan
@@ -365,7 +365,7 @@ def test_broken_episodes_are_drawn_as_far_as_they_go(make_run):
 
 
 @pytest.mark.parametrize("name", ["missing", "empty", "file", "broken", "list"])
-def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
+def test_invalid_run_folder_is_error_of_one_line(tmp_path, name):
     run = tmp_path / name
     if name == "file":
         run.write_text("")
@@ -373,7 +373,7 @@ def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
         run.mkdir()
     if name in ("broken", "list"):
         (run / "config.json").write_text('{"robot": ' if name == "broken" else "[]")
-    with pytest.raises(UserError, match=r"config\.json|no folder") as error:
+    with pytest.raises(UserError, match=r"config\.json|not a folder") as error:
         write_report(run)
     assert str(run) in str(error.value) and "\n" not in str(error.value)
     assert run.is_file() or not (run / "report.html").exists()
@@ -392,7 +392,7 @@ def test_no_run_folder_is_an_error_of_one_line(tmp_path, name):
         "x" * 200,
     ],
 )
-def test_a_name_is_only_ever_text(make_run, name):
+def test_names_are_escaped(make_run, name):
     text, page = read(make_run(unseen=name))
     shown = printable(name)
     assert not any(tag == "script" for tag, _ in page.tags)
@@ -405,7 +405,7 @@ def test_a_name_is_only_ever_text(make_run, name):
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 40), (40, 3), (9, 12), (120, 130)])
-def test_a_maze_fills_its_figure_and_is_drawn_right_way_up(shape):
+def test_maze_fills_figure_with_row_0_at_bottom(shape):
     walls = np.random.default_rng(0).random(shape) < 0.5
     walls[[0, -1]] = walls[:, [0, -1]] = True
     walls[1, 1:-1] = False  # the lowest free row
@@ -424,7 +424,7 @@ def test_a_maze_fills_its_figure_and_is_drawn_right_way_up(shape):
 
 
 @pytest.mark.parametrize("success", [[True], [False], [True, False]])
-def test_a_picture_says_what_its_marks_mean(tmp_path, success):
+def test_picture_has_legend_of_its_marks(tmp_path, success):
     path = np.full((3, len(success), 2), 6.0)
     pairs = SimpleNamespace(start=path[0], goal=path[0] + 4)
     steps = np.full(len(success), 3)
@@ -439,7 +439,7 @@ def test_a_picture_says_what_its_marks_mean(tmp_path, success):
 
 
 @given(st.integers(4, 60), st.floats(1e3, 1e9), st.randoms())
-def test_an_outlier_leaves_room_for_all_others(n, far, random):
+def test_outliers_do_not_compress_scale(n, far, random):
     asked = np.linspace(-90, -10, n)
     got = asked + np.array([random.uniform(-5, 5) for _ in range(n)])
     with pictures.style():
@@ -456,7 +456,7 @@ def test_an_outlier_leaves_room_for_all_others(n, far, random):
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50))
-def test_the_bulk_of_values_holds_the_middle_half(values):
+def test_bulk_contains_middle_half(values):
     low, high = pictures.bulk(np.array(values))
     inside = [value for value in values if low <= value <= high]
     assert 2 * len(inside) >= len(values)
@@ -464,7 +464,7 @@ def test_the_bulk_of_values_holds_the_middle_half(values):
 
 @pytest.mark.parametrize("n", [1, 5])
 @pytest.mark.parametrize("steps", [0, 1, 30])
-def test_paths_of_any_length_can_be_drawn(n, steps):
+def test_paths_of_any_length_are_drawn(n, steps):
     figure = Figure()
     ax = figure.add_subplot()
     path = np.zeros((30, n, 2), np.float32)
@@ -472,10 +472,10 @@ def test_paths_of_any_length_can_be_drawn(n, steps):
     draw_paths(ax, path, np.arange(n) % 2 == 0, np.full(n, steps), path[0], path[0] + 1)
     assert "<path" in pictures.to_svg(figure, "paths")
     marked = [len(points.get_offsets()) for points in ax.collections if isinstance(points, PathCollection)]
-    assert marked == [n, n, n // 2][: 2 + (n > 1)]  # starts, goals and the ends of failures, however short the ways
+    assert marked == [n, n, n // 2][: 2 + (n > 1)]  # starts, goals and ends of failures, also for short paths
 
 
-def test_resampling_keeps_the_way_and_its_ends():
+def test_resampling_keeps_path_and_ends():
     angle = np.linspace(0, 6, 400)
     way = np.stack([np.cos(angle), np.sin(angle)], 1) * 10
     points, time = pictures.resample(way, 0.5)
@@ -484,7 +484,7 @@ def test_resampling_keeps_the_way_and_its_ends():
     assert (np.diff(time) > 0).all() and time[0] == 0 and time[-1] == 1
 
 
-def test_the_running_mean_of_a_line_is_the_line_inside_and_a_mean_at_the_ends():
+def test_running_mean_of_line():
     values = np.arange(100.0)
     smooth = pictures.running_mean(values)
     np.testing.assert_allclose(smooth[5:-5], values[5:-5])
@@ -501,7 +501,7 @@ def test_the_running_mean_of_a_line_is_the_line_inside_and_a_mean_at_the_ends():
         (np.linspace(0, 40, 400), 100, "early"),
     ],
 )
-def test_a_failure_is_told_by_its_way(make_run, way, steps, kind):
+def test_failure_kind_depends_on_path(make_run, way, steps, kind):
     arrays = make_episodes(0, failures=1, n=2)
     path = np.repeat(np.stack([way, np.full(400, 6.0)], 1)[:, None], 2, 1)
     run = make_run()

@@ -1,7 +1,7 @@
-"""A run that is stopped, anywhere and again and again, ends with the weights of one that nothing stopped.
+"""A run that is killed at any point, several times, ends with the same weights as an uninterrupted run.
 
-The command line runs in processes that are forked from one which has imported everything (``fork``), so that a life
-costs what it takes to trace the programs it needs.
+The command line runs in processes that are forked from a process with all imports (``fork``), so that a restart only
+has to trace its programs.
 """
 
 import importlib.util
@@ -31,7 +31,7 @@ OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scan
 
 
 def live(arguments, settings, folder, stage, operations, cache):
-    """One life of a run: to its end, or so many file operations after the first in a stage's folder."""
+    """Run to the end, or for a number of file operations after the first one in a stage's folder."""
     from ct_envs import robots
     from ct_jax import checkpoint, cli, presets
 
@@ -58,24 +58,24 @@ def live(arguments, settings, folder, stage, operations, cache):
 
 
 def weights(folder):
-    """What was learned, to the last bit."""
+    """The exact weights."""
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.glob("*/*.safetensors")}
 
 
 class Killer:
-    """Runs a command to its end, over and over, and kills it on the way: each death is meant for a stage, and comes at
-    random within so many file operations there (an int), or so many seconds (a float)."""
+    """Run a command until it ends, and kill it several times. Each kill is for one stage, after a random number of file
+    operations (an int gives the maximum) or after a random time (a float gives the maximum in seconds)."""
 
     def __init__(self, fork, arguments, settings, deaths, *, seed=0):
         self.fork, self.arguments, self.settings, self.deaths = fork, arguments, settings, list(deaths)
         self.rng, self.died_in = np.random.default_rng(seed), []
 
     def run(self, folder, stages=STAGES):
-        """To the end of all stages; as many deaths on the way as are left."""
+        """Run all stages to the end, with the remaining kills."""
         while True:
             now = next((stage for stage in stages if not (folder / stage / "done.json").is_file()), stages[-1])
             stage, most = self.deaths[0] if self.deaths else (now, 0)
-            stage = max(stage, now, key=stages.index)  # by the clock it may have died too late
+            stage = max(stage, now, key=stages.index)  # a kill by time may come too late
             operations = int(self.rng.integers(1, most + 1)) if isinstance(most, int) and most else 0
             cache = jax.config.jax_compilation_cache_dir
             process = self.fork(live, self.arguments, self.settings, folder, stage, operations, cache)
@@ -101,7 +101,7 @@ def assert_same_end(folder, whole):
     assert not [*folder.glob("*/checkpoints*"), *folder.glob("*/waves*"), *folder.glob("*/*.part")]
 
 
-def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, tmp_path):
+def test_killed_run_equals_uninterrupted_run(fork, tiny_run, tiny_settings, tmp_path):
     killer = Killer(fork, tiny_run.arguments, tiny_settings, [("controller", 60), ("collect", 4), ("finetune", 60)])
     killer.run(tmp_path / "run")
     assert killer.died_in == ["controller", "collect", "finetune"]
@@ -109,8 +109,8 @@ def test_a_killed_run_ends_like_one_that_was_not(fork, tiny_run, tiny_settings, 
 
 
 @pytest.mark.long
-def test_fourteen_deaths_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
-    """Between two file operations, and by the clock: mostly while something is traced, compiled or computed."""
+def test_fourteen_kills_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
+    """Kills between two file operations, and kills by time, which mostly hit tracing, compilation or computation."""
     deaths = [
         ("prm", 4), ("controller", 60), ("controller", 3.0), ("controller", 60), ("collect", 4), ("collect", 3.0),
         ("fit", 60), ("fit", 3.0), ("fit", 60), ("finetune", 60), ("finetune", 5.0), ("finetune", 60),
@@ -126,8 +126,8 @@ def test_fourteen_deaths_in_mazes(fork, tiny_run, tiny_settings, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="PyBullet is not installed")
-def test_six_deaths_in_rooms(fork, tmp_path):
-    """With worker processes, which go when their pool is gone."""
+def test_six_kills_in_rooms(fork, tmp_path):
+    """With worker processes, which end with their pool."""
     stages = ("collect", "fit", "finetune", "evaluate")
     fit = FitConfig(updates=6, batch=4, steps=5, warmup=2)
     settings = replace(
@@ -156,7 +156,7 @@ def test_six_deaths_in_rooms(fork, tmp_path):
 
 
 def train_for_ever(folder):
-    """A training whose second chunk takes XLA minutes."""
+    """A training whose second chunk takes minutes in XLA."""
     from ct_jax.cli import guarded
 
     @jax.jit
@@ -177,8 +177,8 @@ def train_for_ever(folder):
     )  # fmt: skip
 
 
-def test_sigterm_is_obeyed_in_time_in_the_middle_of_a_long_program(fork, tmp_path):
-    """Python cannot even see the signal; what the last chunk left is saved all the same."""
+def test_sigterm_during_long_program_saves_in_time(fork, tmp_path):
+    """Python cannot handle the signal in time, but the state after the last chunk is saved."""
     process = fork(train_for_ever, tmp_path)
     while not (tmp_path / "begun").exists():
         assert process.is_alive()

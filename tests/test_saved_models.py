@@ -1,5 +1,5 @@
-"""What a folder of a model says is not believed: 2,000 mutations of descriptions and weights, none of which gives a
-traceback, is taken out of its range, or changes what a model does.
+"""The files of a model are validated: 2,000 mutations of descriptions and weights. None of them causes a traceback, is
+accepted outside its range, or changes the function of a model.
 """
 
 import copy
@@ -41,14 +41,14 @@ SETTINGS = Settings(
 
 
 def examples(n):
-    """So many of them, the same in every run."""
+    """A number of examples, the same in every run."""
     return settings(
         max_examples=n, derandomize=True, database=None,
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )  # fmt: skip
 
 
-# Nothing that a setting may be, and much that only some may be.
+# Values that no setting or only some settings accept.
 NASTY = [
     None, True, False, -5, -1, 0, 1, 2, 3, 4, 99, 10**9, 2**31, 2**64, 10**400, 0.0, 0.5, 1.0, 2.0, 3.0, -0.5, 1e300,
     float("nan"), float("inf"), "", "1", "3", "x", "ab", "world", "heading", "sideways", "own", "point", "ant", "a\nb",
@@ -57,7 +57,7 @@ NASTY = [
 
 
 def places(value, path=()):
-    """Paths to everything in a JSON value but itself."""
+    """The paths to all parts of a JSON value."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, part in inside:
         yield (*path, key)
@@ -72,7 +72,7 @@ def at(value, path):
 
 @st.composite
 def mutated(draw, value):
-    """A JSON object with one to three things in it replaced, left out, added, moved or wrapped."""
+    """A JSON object with one to three parts replaced, removed, added, moved or wrapped."""
     value = copy.deepcopy(value)
     for _ in range(draw(st.integers(1, 3))):
         found = list(places(value))
@@ -97,7 +97,7 @@ def mutated(draw, value):
 
 
 def refused(load) -> bool:
-    """Whether something is refused as it should be: with a UserError of one line."""
+    """Whether loading raises a UserError of one line."""
     try:
         load()
     except UserError as bad:
@@ -110,7 +110,7 @@ def refused(load) -> bool:
 
 
 def leaves(value):
-    """The settings of a config that are no configs."""
+    """The settings of a config that are not configs."""
     if is_dataclass(value):
         return [leaf for name in value.__dataclass_fields__ for leaf in leaves(getattr(value, name))]
     return [part for entry in value for part in leaves(entry)] if isinstance(value, tuple) else [value]
@@ -118,8 +118,8 @@ def leaves(value):
 
 @given(mutated(json.loads(json.dumps(to_dict(SETTINGS)))))
 @examples(500)
-def test_settings_are_refused_or_sound(values):
-    """What is taken is finite and moderate, of the types of the defaults, and comes back as it is."""
+def test_mutated_settings_are_error_or_valid(values):
+    """Accepted settings are finite and moderate, have the types of the defaults, and survive a round trip."""
     found = []
     if refused(lambda: found.append(from_dict(values))):
         return
@@ -145,7 +145,7 @@ def test_settings_are_refused_or_sound(values):
     st.sampled_from(["point", "ant", "turtlebot3"]),
 )  # fmt: skip
 @examples(40)
-def test_what_is_taken_can_be_built(changes, robot):
+def test_accepted_settings_build_models(changes, robot):
     values = to_dict(SETTINGS)
     values["model"] |= changes
     refused(lambda: blank_model(robot, from_dict(values)))
@@ -181,7 +181,7 @@ def assert_same_model(found, model):
 
 @pytest.fixture(scope="module")
 def model_json(trained, tmp_path_factory):
-    """As it was written: tests change the one in ``folder``."""
+    """The original text; tests change the file in ``folder``."""
     folder = tmp_path_factory.mktemp("unchanged")
     save_model(folder, trained)
     return json.loads((folder / "model.json").read_text())
@@ -189,7 +189,7 @@ def model_json(trained, tmp_path_factory):
 
 @given(data=st.data())
 @examples(500)
-def test_a_changed_description_is_refused_or_means_the_same(folder, model_json, trained, data):
+def test_mutated_model_description_is_error_or_equivalent(folder, model_json, trained, data):
     (folder / "model.json").write_text(json.dumps(data.draw(mutated(model_json))))
     found = []
     if not refused(lambda: found.append(load_model(str(folder)))):
@@ -198,7 +198,7 @@ def test_a_changed_description_is_refused_or_means_the_same(folder, model_json, 
 
 @given(data=st.data())
 @examples(400)
-def test_a_changed_description_of_a_controller_is_refused_or_means_the_same(folder, trained, data):
+def test_mutated_controller_description_is_error_or_equivalent(folder, trained, data):
     place = folder / "controller"
     save_controller(place, "point", SETTINGS.sac, trained.controller, {"seed": 0})
     described = json.loads((place / "controller.json").read_text())
@@ -214,7 +214,7 @@ def test_a_changed_description_of_a_controller_is_refused_or_means_the_same(fold
     st.integers(0, 3000), st.sampled_from(["[" * 100_000, '{"a":' * 100_000, "9" * 5000, "NaN", "-Infinity", "1e999"])
 )
 @examples(60)
-def test_json_that_cannot_be_read_is_one_line(folder, trained, where, what):
+def test_unreadable_json_is_error_of_one_line(folder, trained, where, what):
     save_model(folder, trained)
     text = (folder / "model.json").read_text()
     where = text.index(":", where % (len(text) - 10)) + 1
@@ -224,19 +224,19 @@ def test_json_that_cannot_be_read_is_one_line(folder, trained, where, what):
 
 @pytest.mark.parametrize("change", [{"heads": 1}, {"heads": 4}, {"stride": 2}, {"returns": False},
                                     {"context_acting": 4}, {"map_cell_m": 0.4}, {"commitment": 1.0}])  # fmt: skip
-def test_another_function_of_the_same_weights_is_refused(folder, trained, model_json, change):
-    """Shapes do not tell these from what was saved."""
+def test_changed_model_with_same_shapes_is_error(folder, trained, model_json, change):
+    """The shapes of the weights are the same, but the function differs."""
     save_model(folder, trained)
     settings = model_json["settings"]
-    for number in (1, 2):  # nor does it help to say that an earlier version wrote it
+    for number in (1, 2):  # also if the file claims an earlier format
         changed = model_json | {"format": number, "settings": settings | {"model": settings["model"] | change}}
         (folder / "model.json").write_text(json.dumps(changed))
         with pytest.raises(UserError, match=r"weights\.safetensors: weights of another model"):
             load_model(str(folder))
 
 
-def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
-    """They bound weights to nothing, and said so by their format."""
+def test_files_of_earlier_versions_are_read(folder, trained, model_json):
+    """Their weights have no digest of the description, and their format shows it."""
     save_model(folder, trained)
     weights = folder / "weights.safetensors"
     arrays = {"transformer": trained.policy.params, "value": trained.policy.value_params}
@@ -249,7 +249,7 @@ def test_what_earlier_versions_wrote_is_read(folder, trained, model_json):
 
 
 @pytest.mark.parametrize("number", [0, 4, 99, None, "2", 2.0, True])
-def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json, number):
+def test_unknown_format_is_error_with_known_formats(folder, trained, model_json, number):
     save_model(folder, trained)
     (folder / "model.json").write_text(json.dumps(model_json | {"format": number}))
     with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 to 3"):
@@ -257,7 +257,7 @@ def test_an_unknown_format_is_refused_with_the_known(folder, trained, model_json
 
 
 @pytest.mark.parametrize("name", zoo_names())
-def test_shipped_weights_are_bound_to_their_description(name, tmp_path):
+def test_shipped_weights_belong_to_their_description(name, tmp_path):
     place = model_folder("zoo:" + name)
     for file in place.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -286,7 +286,7 @@ def weights(tmp_path_factory):
 
 @given(data=st.data())
 @examples(400)
-def test_changed_bytes_are_refused_or_change_nothing(weights, data):
+def test_changed_bytes_are_error_or_have_no_effect(weights, data):
     file, whole = weights
     parts = bytearray(whole)
     for _ in range(data.draw(st.integers(1, 3))):
@@ -317,8 +317,8 @@ TYPES = [np.float64, np.float16, np.int8, np.int32, np.bool_, np.uint32, np.comp
 
 @given(data=st.data())
 @examples(200)
-def test_wrong_arrays_are_refused_though_their_sum_is_right(weights, data):
-    """Of another type or shape, not finite, missing, or too many."""
+def test_wrong_arrays_with_correct_sum_are_error(weights, data):
+    """Arrays of another type or shape, arrays that are not finite, missing arrays, and additional arrays."""
     file, _ = weights
     arrays = dict(FLAT)
     name = data.draw(st.sampled_from(sorted(arrays)))
@@ -346,7 +346,7 @@ def test_wrong_arrays_are_refused_though_their_sum_is_right(weights, data):
     assert refused(lambda: load_weights(file, TREE))
 
 
-def test_refused_weights_say_what_was_found_and_what_is_needed(weights):
+def test_error_of_weights_shows_found_and_needed_shape(weights):
     file, _ = weights
 
     def refusal(arrays, **metadata):
@@ -366,13 +366,13 @@ def test_refused_weights_say_what_was_found_and_what_is_needed(weights):
 
 
 @pytest.mark.parametrize("kind", ["F8_E4M3", "F8_E8M0"])
-def test_types_that_numpy_has_not_are_refused(tmp_path, kind):
+def test_types_unknown_to_numpy_are_error(tmp_path, kind):
     header = json.dumps({"a": {"dtype": kind, "shape": [2, 3], "data_offsets": [0, 6]}}).encode()
     (tmp_path / "w.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(6))
     assert refused(lambda: load_weights(tmp_path / "w.safetensors", TREE))
 
 
-def test_a_training_that_diverged_says_so_instead_of_saving(tmp_path):
+def test_diverged_weights_are_error_when_saved(tmp_path):
     with pytest.raises(UserError, match="'a' has become infinite or NaN in training; try a lower learning rate"):
         save_weights(tmp_path / "w.safetensors", {"a": np.float32([1.0, np.nan])})
     assert not list(tmp_path.iterdir())

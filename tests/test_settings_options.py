@@ -1,4 +1,4 @@
-"""Every setting of the method is an option of ``ct-jax train``, and ends in the run's settings."""
+"""Every setting of the method is an option of ``ct-jax train``, and is stored in the settings of the run."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from ct_jax.settings import Settings, to_dict
 
 @pytest.fixture
 def settings_of(monkeypatch, tmp_path):
-    """The settings of the run that a command line would train."""
+    """A function from command line arguments to the settings of the run."""
 
     def settings_of(*arguments: str) -> Settings:
         runs = []
@@ -34,7 +34,7 @@ def leaves(values: dict, path: str = ""):
         yield from leaves(value, f"{path}{name}.") if isinstance(value, dict) else [(path + name, value)]
 
 
-def test_settings_take_the_place_of_the_presets(settings_of):
+def test_options_override_preset(settings_of):
     plain = get_preset("demo", "ant")
     found = settings_of(
         "ant", "--preset", "demo", "--fit.updates", "500", "--model.width=256", "--collect.noise", "0.3",
@@ -48,7 +48,7 @@ def test_settings_take_the_place_of_the_presets(settings_of):
     assert json.loads(json.dumps(to_dict(found)))["fit"]["updates"] == 500
 
 
-def test_without_changes_they_are_the_presets(settings_of):
+def test_settings_without_options_equal_preset(settings_of):
     assert settings_of("point", "--preset", "cpu") == get_preset("cpu", "point")
 
 
@@ -56,7 +56,7 @@ def test_without_changes_they_are_the_presets(settings_of):
     ("arguments", "says"),
     [
         (["--fit.updates", "-3"], "FitConfig.updates is -3"),
-        (["--fit.updates", "many"], "'many' is no whole number"),
+        (["--fit.updates", "many"], "'many' is not a whole number"),
         (["--fit.nonsense", "3"], "--fit.nonsense"),
         (["--model.frame", "sideways"], "sideways"),
         (["--model.heads", "3"], "multiple of heads"),
@@ -64,14 +64,14 @@ def test_without_changes_they_are_the_presets(settings_of):
         (["--nonsense"], "--nonsense"),
     ],
 )
-def test_a_wrong_setting_is_one_line(capsys, tmp_path, arguments, says):
+def test_wrong_setting_is_error_of_one_line(capsys, tmp_path, arguments, says):
     assert cli.main(["train", "point", *arguments, "--out", str(tmp_path / "run")]) == cli.BAD_INPUT
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 1 and says in error[0] and "--help-all" in error[0]
     assert not (tmp_path / "run").exists()
 
 
-def test_help_all_lists_every_setting(capsys):
+def test_help_all_lists_all_settings(capsys):
     assert cli.main(["train", "ant", "--preset", "cpu", "--help-all"]) == 0
     shown = capsys.readouterr().out
     for name, _ in leaves(dataclasses.asdict(dataclasses.replace(get_preset("cpu", "ant"), rooms=None))):

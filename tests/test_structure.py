@@ -1,4 +1,4 @@
-"""What the sources themselves must keep to: imports go one way, functions are short, nothing is unpickled."""
+"""Rules for the sources: imports go one way, functions are short, and nothing is unpickled."""
 
 import ast
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import pytest
 import ct_jax
 
 ROOT = Path(__file__).parents[1]
-# Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
+# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here.
 ORDER = [
     *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "progress"],
     *["types", "prm", "guides", "pairs", "trajectories", "guided", "collect"],
@@ -32,7 +32,7 @@ LONGEST = 80  # lines of a function
 
 
 def sources(folder: str) -> dict[str, Path]:
-    """Files of a folder by the name they are imported by; a package's ``__init__`` bears the package's."""
+    """The files of a folder by their import names. ``__init__`` has the name of its package."""
     top = ROOT / ("envs" if folder == "ct_envs" else "")
     files = sorted((top / folder).rglob("*.py"))
     return {".".join(file.relative_to(top).with_suffix("").parts).removesuffix(".__init__"): file for file in files}
@@ -43,7 +43,7 @@ SHIPPED = PACKAGES | sources("experiments") | sources("benchmarks")
 
 
 def imports(text: str, module: str, *, package: bool = False) -> Iterator[str]:
-    """Everything imported anywhere in a source, with the names taken: "ct_jax.prm.Roadmap"."""
+    """All imports in a source, with the imported names, such as "ct_jax.prm.Roadmap"."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -59,18 +59,18 @@ def imports_of(module: str) -> set[str]:
 
 
 def within(name: str, modules: set[str]) -> bool:
-    """Whether a dotted name is one of the modules, or inside one."""
+    """Whether a dotted name is one of the modules, or is inside one of them."""
     return any(name == module or name.startswith(module + ".") for module in modules)
 
 
 def rank(module: str) -> int:
-    """Place of a module of ct_jax in the order; -1 for the package itself."""
+    """The position of a module of ct_jax in the order; -1 for the package itself."""
     stage = [*module.split("."), ""][1]
     return ORDER.index(stage) if stage else -1
 
 
 def later_stages(text: str, module: str, *, package: bool = False) -> list[str]:
-    """Imports of ct_jax that a module of it must not make: of later stages, or of public names, which hide theirs."""
+    """The forbidden imports of a module of ct_jax: later stages, and public names, which hide the stages."""
     names = [name for name in imports(text, module, package=package) if within(name, {"ct_jax"})]
     stages = [name for name in names if name.split(".")[1:2] and name.split(".")[1] in ORDER]
     public = [name for name in names if name.split(".")[1:2] and name.split(".")[1] in ct_jax.__all__]
@@ -78,7 +78,7 @@ def later_stages(text: str, module: str, *, package: bool = False) -> list[str]:
 
 
 def at_import(text: str) -> str:
-    """A source without what only type checkers read."""
+    """A source without the code for type checkers."""
 
     class Runs(ast.NodeTransformer):
         def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
@@ -100,7 +100,7 @@ def long_functions(text: str) -> list[str]:
 
 
 def unpicklings(text: str, module: str = "") -> list[str]:
-    """Imports of picklers, and calls that would let NumPy unpickle."""
+    """Imports of pickle modules, and calls that allow NumPy to unpickle."""
     calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
     keywords = (keyword for call in calls for keyword in call.keywords if keyword.arg == "allow_pickle")
     allowed = [k.arg for k in keywords if not (isinstance(k.value, ast.Constant) and k.value.value is False)]
@@ -110,23 +110,23 @@ def unpicklings(text: str, module: str = "") -> list[str]:
 # -------------------------------------------------------------------------------------------------- the rules
 
 
-def test_the_sources_were_found():
+def test_sources_are_found():
     assert {"ct_envs", "ct_envs.maze", "ct_jax", "ct_jax.prm", "ct_jax.worlds.mazes"} <= set(PACKAGES)
 
 
 @pytest.mark.parametrize("module", PACKAGES)
-def test_packages_know_nothing_of_their_users(module):
+def test_packages_do_not_import_their_users(module):
     below = {"ct_jax"} if module.startswith("ct_envs") else set()
     assert not [name for name in imports_of(module) if within(name, USERS | below)]
 
 
 @pytest.mark.parametrize("module", sources("ct_envs"))
-def test_worlds_know_nothing_of_learning(module):
+def test_ct_envs_does_not_import_learning(module):
     assert not [name for name in imports_of(module) if within(name, LEARNING)]
 
 
 @pytest.mark.parametrize("module", sources("ct_jax"))
-def test_stages_import_earlier_ones_only(module):
+def test_stages_import_only_earlier_stages(module):
     stage = [*module.split("."), ""][1]
     assert not stage or stage in ORDER, f"give {stage} its place in ORDER"
     file = SHIPPED[module]
@@ -148,7 +148,7 @@ def test_only_worlds_know_a_simulator(module):
 
 
 @pytest.mark.parametrize("module", SHIPPED)
-def test_no_function_is_long(module):
+def test_functions_are_short(module):
     assert not long_functions(SHIPPED[module].read_text("utf-8"))
 
 
@@ -175,7 +175,7 @@ def test_nothing_is_unpickled(module):
         ("from .sac import Sac", "ct_jax.controllers.differential_drive", []),
     ],
 )
-def test_a_wrong_import_is_found(text, module, found):
+def test_wrong_import_is_found(text, module, found):
     assert later_stages(text, module) == found
 
 
@@ -201,12 +201,12 @@ def test_what_only_type_checkers_read_is_no_import():
     assert later_stages(at_import(text), "ct_jax") == ["ct_jax.fit", "ct_jax.run"]
 
 
-def test_relative_imports_of_a_package_start_at_itself():
+def test_relative_imports_start_at_package():
     assert list(imports("from .page import page", "ct_jax.report", package=True)) == ["ct_jax.report.page.page"]
     assert list(imports("from .page import page", "ct_jax.report.words")) == ["ct_jax.report.page.page"]
 
 
-def test_a_long_function_is_found():
+def test_long_function_is_found():
     body = "    x = 1\n"
     assert long_functions("def short():\n" + (LONGEST - 1) * body) == []
     assert long_functions("class A:\n  def long():\n" + LONGEST * body) == ["long"]
@@ -223,6 +223,6 @@ def test_a_long_function_is_found():
         "np.load(file, allow_pickle=flag)",
     ],
 )
-def test_an_unpickling_is_found(text):
+def test_unpickling_is_found(text):
     assert unpicklings(text)
     assert not unpicklings("import numpy as np\nnp.load(file, allow_pickle=False)")

@@ -1,4 +1,4 @@
-"""What reaches the terminal cannot command it, whatever it shows, and whatever it can show."""
+"""Output to a terminal has no control characters, and works on terminals with any encoding."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ from ct_jax.progress import Bar
 from ct_jax.terminal import one_line, printable, show_anything
 
 ROOT = Path(__file__).parents[1]
-EVIL = "\x1b]0;mine\x07\x1b[31m[/red]:smile:\u202e\n"  # to rich, too
+EVIL = "\x1b]0;mine\x07\x1b[31m[/red]:smile:\u202e\n"  # also markup of rich
 ROW = {
     "method": "ct", "success_rate": 0.5, "success_ci95": [0.25, 0.75], "spl": 0.5, "return_scaled": -1.0,
     "collision_rate": 0.0, "steps_mean": 3.0,
@@ -33,7 +33,7 @@ def shell(*arguments, **variables):
 
 
 @given(st.text())
-def test_what_is_printable_cannot_command_a_terminal(text):
+def test_printable_text_has_no_control_characters(text):
     shown = printable(text)
     assert all(c.isprintable() or c.isspace() for c in shown) and len(shown.splitlines()) <= 1
     assert printable(shown) == shown
@@ -42,7 +42,7 @@ def test_what_is_printable_cannot_command_a_terminal(text):
 
 
 @given(st.characters(exclude_categories=["Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"]))
-def test_letters_of_all_languages_stay(letter):
+def test_letters_of_all_languages_are_kept(letter):
     assert printable(letter) == letter
 
 
@@ -56,13 +56,13 @@ def test_any_text_can_be_printed_in_any_encoding(text):
             out.flush()
 
 
-def test_a_table_shows_names_as_they_are(capsys):
+def test_table_shows_names_without_markup(capsys):
     print_rows([ROW | {"maze": EVIL}])
     out = capsys.readouterr().out
     assert printable(EVIL) in out and "\x1b" not in out and out.count("\n") == 2
 
 
-def test_a_bar_shows_names_as_they_are():
+def test_bar_shows_names_without_markup():
     screen = io.StringIO()
     with Bar(f"ct in {EVIL}", 10, console=Console(file=screen, force_terminal=True, width=200)) as bar:
         bar.update(5)
@@ -81,7 +81,7 @@ def test_a_bar_shows_names_as_they_are():
         ["evaluate", "zoo:point", "--picture", EVIL], ["train", EVIL], [EVIL],
     ],
 )  # fmt: skip
-def test_an_error_shows_names_as_they_are(arguments, monkeypatch, capsys):
+def test_error_shows_names_without_control_characters(arguments, monkeypatch, capsys):
     monkeypatch.setattr("ct_jax.cli.prepare_jax", lambda *_: None)
     assert main(arguments) == 2
     err = capsys.readouterr().err
@@ -96,7 +96,7 @@ def test_an_error_shows_names_as_they_are(arguments, monkeypatch, capsys):
         ["evaluate", "zoo:point", "--density", "a-rather-long-word-that-no-narrow-terminal-shows-in-a-single-line"],
     ],
 )  # fmt: skip
-def test_an_error_is_the_same_on_every_terminal(arguments, variables):
+def test_error_does_not_depend_on_terminal(arguments, variables):
     said = [shell(*arguments, COLUMNS="80"), shell(*arguments, **variables)]
     assert said[0].returncode == said[1].returncode == 2
     assert said[0].stderr == said[1].stderr and said[0].stderr.count(b"\n") == 1
@@ -104,15 +104,15 @@ def test_an_error_is_the_same_on_every_terminal(arguments, variables):
 
 
 @pytest.mark.parametrize("arguments", [["mazes"], ["--help"], ["train", "--help"]])
-def test_a_terminal_of_few_letters_shows_what_it_can(arguments):
+def test_ascii_terminal_shows_similar_characters(arguments):
     done = shell(*arguments, **ASCII)
     assert (done.returncode, done.stderr) == (0, b"") and len(done.stdout.decode("ascii")) > 500
     assert b"\\u" not in done.stdout
 
 
 @pytest.mark.parametrize("arguments", [["mazes"], ["--version"], ["--help"], ["evaluate", "zoo:point", "--json"]])
-def test_a_full_device_is_told_in_one_line(arguments):
-    """Before anything is evaluated, which would take longer than this test may."""
+def test_full_device_is_error_of_one_line(arguments):
+    """The error comes before the evaluation, which would take longer than this test."""
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -124,14 +124,14 @@ def test_a_full_device_is_told_in_one_line(arguments):
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
-def test_closed_streams_are_no_error(closed):
+def test_closed_streams_are_not_an_error(closed):
     paths = os.pathsep.join([str(ROOT), str(ROOT / "envs")])
     command = f"{sys.executable} -m ct_jax.cli mazes {closed}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, env=os.environ | {"PYTHONPATH": paths})
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_an_error_of_the_system_is_one_line(capsys):
+def test_system_error_is_one_line(capsys):
     def fail():
         raise OSError(5, "Input/output error", EVIL)
 

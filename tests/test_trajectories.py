@@ -1,4 +1,4 @@
-"""Trajectories: nothing is lost on the way from the record of an episode to a window of it."""
+"""Trajectories: from recorded episodes to training windows without loss."""
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ def assert_same(a, b) -> None:
 
 @given(st.integers(0, 2**31 - 1), st.lists(st.integers(0, 9), min_size=3, max_size=3))
 @settings(max_examples=20)
-def test_return_to_go_is_the_sum_of_what_is_to_come(toy_data, seed, lengths):
+def test_return_to_go_is_sum_of_future_rewards(toy_data, seed, lengths):
     data = toy_data(lengths, seed=seed, steps=9)
     rtg = np.asarray(data.rtg)
     for i, length in enumerate(lengths):
@@ -54,7 +54,7 @@ def test_return_to_go_is_the_sum_of_what_is_to_come(toy_data, seed, lengths):
         np.testing.assert_allclose(rtg[i], expected, rtol=1e-5, atol=1e-4)
 
 
-def test_padding_has_no_say_in_the_return(toy_data):
+def test_padding_does_not_affect_return(toy_data):
     data = toy_data(LENGTHS)
     padding = np.arange(data.reward.shape[1]) >= data.length[:, None]
     other = data.replace(reward=np.where(padding, np.nan, data.reward))
@@ -69,12 +69,12 @@ def windows(data: Trajectories, seed: int = 0, **options):
 
 
 def which_step(window, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Trajectory and step [B, S] that pieces are of; after the end of a short one, of its last step."""
+    """Trajectory and step [B, S] of windows. After the end of a short trajectory, it is the last step."""
     i = np.asarray(window.proprio)[:, :1, 0].astype(int)
     return np.broadcast_to(i, window.valid.shape), np.asarray(window.proprio)[..., 1].astype(int)
 
 
-def test_maps_are_what_the_robot_saw_there(toy_data):
+def test_maps_match_positions(toy_data):
     data = toy_data(LENGTHS, mazes=3)
     window = windows(data, steps=12)
     i, t = which_step(window, data)
@@ -87,7 +87,7 @@ def test_maps_are_what_the_robot_saw_there(toy_data):
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_a_window_is_a_piece_of_a_trajectory(toy_data, stride):
+def test_window_is_part_of_trajectory(toy_data, stride):
     data = toy_data(LENGTHS)
     data = data.replace(label_mask=(np.random.default_rng(0).random(data.label_mask.shape) < 0.5).astype(np.float32))
     window = windows(data, steps=5, stride=stride)
@@ -100,11 +100,11 @@ def test_a_window_is_a_piece_of_a_trajectory(toy_data, stride):
         np.testing.assert_array_equal(getattr(window, name)[inside], getattr(data, name)[i, t][inside], err_msg=name)
     np.testing.assert_array_equal(np.asarray(window.rtg)[inside], np.asarray(data.rtg)[i, t][inside])
     assert not np.asarray(window.label_mask)[~inside].any()
-    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones are cut
+    assert (~inside).any() and not (~inside)[np.asarray(data.length)[i] >= 5 * stride].any()  # only short ones
 
 
-def test_single_steps_are_drawn_evenly(toy_data):
-    """A chi-square test on all steps of the data, with a fixed seed; padding is never drawn."""
+def test_single_steps_are_drawn_uniformly(toy_data):
+    """A chi-square test over all steps of the data, with a fixed seed. Padding is never drawn."""
     data = toy_data([3, 0, 17, 40])
     counts = np.zeros(data.reward.shape)
     for seed in range(3):
@@ -118,7 +118,7 @@ def test_single_steps_are_drawn_evenly(toy_data):
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_each_step_can_be_part_of_a_piece(toy_data, stride):
+def test_all_steps_occur_in_windows(toy_data, stride):
     data = toy_data(LENGTHS)
     window = windows(data, steps=8, batch=2000, stride=stride)
     i, t = which_step(window, data)
@@ -131,7 +131,7 @@ def test_each_step_can_be_part_of_a_piece(toy_data, stride):
 
 
 @pytest.mark.parametrize(("stride", "steps"), [(1, 8), (3, 4)])
-def test_first_and_last_steps_are_learned_as_often_as_others(toy_data, stride, steps):
+def test_all_steps_are_equally_likely(toy_data, stride, steps):
     data = toy_data([40])
     window = windows(data, steps=steps, batch=4000, stride=stride)
     counts = np.bincount(which_step(window, data)[1].ravel(), minlength=40)
@@ -139,7 +139,7 @@ def test_first_and_last_steps_are_learned_as_often_as_others(toy_data, stride, s
     assert counts[[0, -1]].min() > 0.9 * middle.mean() and window.valid.all()
 
 
-def test_shifted_timesteps_keep_their_pace(toy_data):
+def test_shifted_timesteps_keep_their_differences(toy_data):
     data = toy_data([30])
     plain, shifted = windows(data), windows(data, shift_timestep=9)
     shift = np.asarray(shifted.timestep - plain.timestep)
@@ -151,33 +151,33 @@ def test_shifted_timesteps_keep_their_pace(toy_data):
 # ------------------------------------------------------------------------------------------------- symmetries
 
 
-def test_the_eight_symmetries_are_a_group(toy_data):
+def test_eight_symmetries_are_a_group(toy_data):
     one = jax.tree.map(lambda leaf: leaf[:1], windows(toy_data([30], seed=3)))
     images = [mirror_windows(jnp.array([s]), GROUP, one) for s in range(8)]
     names = ("map", "proprio", "goal_relative", "action", "label")
 
     def index(window) -> int:
-        """Which image a window is; there must be one."""
+        """The index of the symmetry that gives a window."""
         equal = [all(np.array_equal(getattr(window, n), getattr(image, n)) for n in names) for image in images]
         assert sum(equal) == 1
         return equal.index(True)
 
-    assert [index(image) for image in images] == list(range(8))  # all differ
+    assert [index(image) for image in images] == list(range(8))  # all are different
     table = np.array([[index(mirror_windows(jnp.array([s]), GROUP, image)) for image in images] for s in range(8)])
     for line in (*table, *table.T):
-        assert sorted(line) == list(range(8))  # closed, and each can be undone
+        assert sorted(line) == list(range(8))  # closed, with inverses
     assert (table[0] == np.arange(8)).all()
     assert (table != table.T).any()  # rotations and reflections do not commute
 
 
 def element(bits: int) -> int:
-    """Number in the group of: swap x and y (bit 0), then flip x (bit 1), then flip y (bit 2)."""
+    """Index in the group for: swap x and y (bit 0), then flip x (bit 1), then flip y (bit 2)."""
     world = np.diag([1.0 - (bits & 2), 1.0 - (bits >> 1 & 2)]) @ (np.eye(2)[::-1] if bits & 1 else np.eye(2))
     return int(np.flatnonzero((GROUP.world == world).all((1, 2)))[0])
 
 
 def turn_world(symmetry: int, mazes, data: Trajectories):
-    """The same episodes in a mirrored world, from nothing but what each bit is said to mean."""
+    """The same episodes in a mirrored world, computed from the definition of the bits."""
     side = mazes.shape[0] * 4.0
     walls, centre = np.asarray(mazes.walls), np.float32(side / 2)
     points = {"position": np.asarray(data.position) - centre, "goal_world": np.asarray(data.goal_world) - centre}
@@ -194,8 +194,8 @@ def turn_world(symmetry: int, mazes, data: Trajectories):
 
 
 @pytest.mark.parametrize("symmetry", range(8))
-def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry):
-    """Positions on a grid of 1/64 m and map cells of 3/4 m: every sum is exact, so equality is, too."""
+def test_mirrored_window_equals_window_of_mirrored_world(toy_data, symmetry):
+    """Positions on a grid of 1/64 m and map cells of 3/4 m make all sums exact, so that windows can be equal."""
     mazes = stack_mazes([make_maze(random_walls(seed, height=12, width=12, density=0.7)) for seed in range(3)])
     data = toy_data([20, 9], mazes=3, side_m=48.0, seed=symmetry)
     data = data.replace(
@@ -209,7 +209,7 @@ def test_a_mirrored_window_is_a_window_of_the_mirrored_world(toy_data, symmetry)
     assert_same(mirror_windows(jnp.full(16, element(symmetry)), GROUP, window), other)
 
 
-def test_mirroring_draws_all_symmetries(toy_data):
+def test_mirroring_samples_all_symmetries(toy_data):
     data = toy_data([30])
     plain, mirrored = windows(data), windows(data, symmetries=GROUP)
     found = {
@@ -231,7 +231,7 @@ def test_saving_and_loading_is_the_identity(toy_data, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "text", "half", "one byte", "other arrays", "pickle"])
-def test_a_damaged_file_is_named(toy_data, tmp_path, damage):
+def test_damaged_file_is_error(toy_data, tmp_path, damage):
     file = tmp_path / "data.npz"
     save(toy_data(LENGTHS), file)
     whole = file.read_bytes()
@@ -252,7 +252,7 @@ def test_a_damaged_file_is_named(toy_data, tmp_path, damage):
 
 
 def damaged(arrays, draw):
-    """Arrays of trajectories with one of them changed into what it may not be."""
+    """Arrays of trajectories; one of them has an invalid value."""
     name = draw(st.sampled_from(sorted(arrays)))
     array = arrays[name]
     match draw(st.sampled_from(["missing", "type", "axis", "cut", "value"])):
@@ -275,7 +275,7 @@ def damaged(arrays, draw):
 
 @given(data=st.data())
 @settings(max_examples=200, derandomize=True, database=None)
-def test_arrays_that_are_no_trajectories_are_named(toy_data, tmp_path_factory, data):
+def test_invalid_arrays_are_error(toy_data, tmp_path_factory, data):
     good = toy_data(LENGTHS)
     if data.draw(st.booleans()):
         maps = np.zeros((*good.reward.shape, 2, 25, 25), np.uint8)
@@ -288,7 +288,7 @@ def test_arrays_that_are_no_trajectories_are_named(toy_data, tmp_path_factory, d
 
 @given(st.data())
 @settings(max_examples=200, derandomize=True, database=None)
-def test_changed_bytes_of_a_file_are_refused_or_change_nothing(toy_data, tmp_path_factory, data):
+def test_changed_bytes_are_error_or_have_no_effect(toy_data, tmp_path_factory, data):
     good, file = toy_data([2, 3]), tmp_path_factory.getbasetemp() / "changed.npz"
     save(good, file)
     content = bytearray(file.read_bytes())
@@ -303,7 +303,7 @@ def test_changed_bytes_of_a_file_are_refused_or_change_nothing(toy_data, tmp_pat
         assert_same(found, good)
 
 
-def test_what_lies_beyond_a_trajectorys_end_means_nothing(toy_data, tmp_path):
+def test_padding_in_file_is_ignored(toy_data, tmp_path):
     good = toy_data([2, 5])
     reward = good.reward.copy()
     reward[0, 2:] = np.nan
@@ -313,7 +313,7 @@ def test_what_lies_beyond_a_trajectorys_end_means_nothing(toy_data, tmp_path):
 
 @pytest.mark.parametrize("steps", [(2, 40, 300), (64, 65, 2), (7, 7, 7)])
 def test_joining_keeps_everything(toy_data, steps):
-    """Whatever the padding of the parts: it may be cut, but no step is."""
+    """For any padding of the parts. Padding may be cut, but steps are not."""
     parts = [toy_data([1, n // 2, n], seed=n, steps=n + extra) for n, extra in zip(steps, (0, 9, 400), strict=True)]
     whole = concatenate(parts)
     assert whole.n == 9
@@ -327,7 +327,7 @@ def test_joining_keeps_everything(toy_data, steps):
     assert whole.position.shape[1] < max(steps) + 64
 
 
-def test_selecting_takes_integers_and_bools(toy_data):
+def test_selection_by_integers_and_bools(toy_data):
     data = toy_data(LENGTHS)
     assert_same(select(data, np.array([2, 0])), concatenate_exact(data, [2, 0]))
     assert_same(select(data, np.array([True, False, True])), concatenate_exact(data, [0, 2]))
@@ -337,13 +337,13 @@ def concatenate_exact(data: Trajectories, index: list[int]) -> Trajectories:
     return Trajectories(**{name: np.stack([leaf[i] for i in index]) for name, leaf in fields(data).items()})
 
 
-def test_a_thousand_trajectories_take_megabytes(toy_data):
+def test_memory_of_a_thousand_trajectories(toy_data):
     data = toy_data([128] * 1000)
     assert data.nbytes == sum(leaf.nbytes for leaf in fields(data).values())
     assert data.nbytes < 32e6
 
 
-def test_without_compilation_a_window_is_the_same(toy_data):
+def test_window_is_the_same_without_jit(toy_data):
     data = toy_data(LENGTHS, mazes=3)
     compiled = windows(data, batch=2, steps=2)
     with jax.disable_jit():
@@ -357,7 +357,7 @@ def test_without_compilation_a_window_is_the_same(toy_data):
 
 @pytest.fixture
 def kept(toy_data):
-    """Makes trajectories that keep the maps and goals of their steps, which here say which step it is."""
+    """Make trajectories with stored maps and goals, which contain the index of the step."""
 
     def make(lengths):
         data = toy_data(lengths)
@@ -369,12 +369,12 @@ def kept(toy_data):
 
 @given(st.integers(0, 2**31 - 1))
 @settings(max_examples=5)
-def test_packed_maps_are_the_maps(seed):
+def test_packing_of_maps_is_lossless(seed):
     maps = np.random.default_rng(seed).integers(0, 2, (3, 4, 2, 25, 25), dtype=np.uint8)
     np.testing.assert_array_equal(unpack_maps(pack_maps(maps)), maps)
 
 
-def test_kept_maps_and_goals_come_back_and_need_no_maze(kept):
+def test_stored_maps_and_goals_need_no_maze(kept):
     data, maps = kept(LENGTHS)
     window = draw(jax.random.key(0), data, data.rtg, None, batch=64, steps=5, map_cell_m=CELL)
     i, t = which_step(window, data)
@@ -382,7 +382,7 @@ def test_kept_maps_and_goals_come_back_and_need_no_maze(kept):
     np.testing.assert_array_equal(window.goal_relative, np.stack([i, t], -1) + np.float32(0.5))
 
 
-def test_kept_maps_survive_saving_padding_and_joining(kept, tmp_path):
+def test_stored_maps_survive_saving_padding_and_joining(kept, tmp_path):
     data, _ = kept(LENGTHS)
     save(data, tmp_path / "data.npz")
     assert_same(data, load(tmp_path / "data.npz"))
@@ -391,8 +391,8 @@ def test_kept_maps_survive_saving_padding_and_joining(kept, tmp_path):
     assert_same(joined, concatenate([data]))
 
 
-def test_the_turtlebot_mirrored_sees_left_and_right_change_places(kept):
-    """Its own frame: rows of the map run to the left, so they are reversed, and only what points sideways changes."""
+def test_mirrored_turtlebot3_swaps_left_and_right(kept):
+    """In its own frame, rows of the map run to the left, so they are reversed. Only sideways components change."""
     data, _ = kept([30])
     group = symmetries(ROBOTS["turtlebot3"])
     assert len(group.world) == 2

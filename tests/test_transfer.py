@@ -1,4 +1,4 @@
-"""Transfer: the trunk is the old robot's, the body the new one's, and nothing else is mixed up."""
+"""Transfer: the trunk comes from the old robot's model, and the body from the new robot's."""
 
 import sys
 from dataclasses import replace
@@ -29,7 +29,7 @@ def params(seed, proprio, motors, **changes):
 
 
 @pytest.mark.parametrize(("proprio", "actions", "frame"), [(27, 8, "heading"), (27, 8, "world"), (2, 2, "world")])
-def test_the_trunk_is_kept_and_the_body_is_fresh(proprio, actions, frame):
+def test_trunk_is_transferred_and_body_is_new(proprio, actions, frame):
     source, fresh = params(0, 2, 2), params(1, proprio, actions, frame=frame)
     moved = transfer(source, fresh)
     assert jax.tree.structure(moved) == jax.tree.structure(fresh)
@@ -39,8 +39,8 @@ def test_the_trunk_is_kept_and_the_body_is_fresh(proprio, actions, frame):
         jax.tree.map(np.testing.assert_array_equal, leaves, whose["params"][name])
 
 
-def test_a_trunk_may_come_from_a_model_that_sees_its_actions_or_not():
-    """What becomes of past actions is the body's."""
+def test_trunk_with_and_without_action_inputs():
+    """The embedding of past actions belongs to the body."""
     blind, seeing = params(0, 2, 2, actions=False), params(1, 27, 8)
     assert "embed_action" not in transfer(seeing, blind)["params"]
     moved = transfer(blind, seeing)["params"]
@@ -49,18 +49,18 @@ def test_a_trunk_may_come_from_a_model_that_sees_its_actions_or_not():
 
 
 @pytest.mark.parametrize("changes", [{"width": 32}, {"max_timestep": 64}])
-def test_models_of_other_sizes_are_refused(changes):
+def test_models_of_other_widths_are_error(changes):
     with pytest.raises(UserError, match=r"has shape \(.*\), this robot's model needs \("):
         transfer(params(0, 2, 2), params(1, 27, 8, **changes))
 
 
-def test_models_of_other_depths_are_refused():
+def test_models_of_other_depths_are_error():
     with pytest.raises(UserError, match="different layers"):
         transfer(params(0, 2, 2), params(1, 27, 8, layers=2))
 
 
-def test_a_curve_goes_on_from_mark_to_mark_and_is_kept(tiny, tiny_run, tmp_path):
-    """Two marks on the way end where one fit does, and a second call has nothing left to do."""
+def test_curve_continues_from_mark_to_mark(tiny, tiny_run, tmp_path):
+    """Training with two marks ends like one training, and a second call repeats nothing."""
     options = experiment.Options(point=tiny_run.folder, ant=tiny_run.folder, episodes=4, out=tmp_path)
     target = experiment.Target.of(tiny_run.folder, 40)
     trained_in = load_maze(tiny_run.arguments[tiny_run.arguments.index("--maze") + 1])

@@ -1,4 +1,4 @@
-"""The value network: an undiscounted return that is never positive, learned from what came after."""
+"""The value network: it learns the undiscounted return, which is never positive."""
 
 import jax
 import jax.numpy as jnp
@@ -31,8 +31,8 @@ apply = jax.jit(MODEL.apply)
 PARAMS = jax.jit(MODEL.init)(jax.random.key(0), *observations(0, 1))
 
 
-def test_no_return_is_positive():
-    """Rewards are minus distances; the network cannot promise more than none, whatever its parameters."""
+def test_predicted_return_is_never_positive():
+    """Rewards are minus distances. The predicted return is at most 0 for any parameters."""
     leaves, structure = jax.tree.flatten(PARAMS)
     values = []
     for seed in range(6):
@@ -45,7 +45,7 @@ def test_no_return_is_positive():
     assert np.ptp(values) > 100
 
 
-def test_the_loss_is_the_squared_error_of_the_undiscounted_return():
+def test_loss_is_squared_error_of_undiscounted_return():
     inputs = observations(3, 8)
     rtg = -100.0 * jnp.arange(1.0, 9.0)[:, None]
     valid = (jnp.arange(8) < 6).astype(jnp.float32)[:, None]
@@ -59,8 +59,8 @@ def test_the_loss_is_the_squared_error_of_the_undiscounted_return():
     np.testing.assert_allclose(loss(PARAMS, garbage, key), expected, rtol=1e-5)
 
 
-def test_it_learns_the_mean_of_what_comes_after():
-    """Two kinds of states, told apart by the goal, each with returns that vary about a mean of its own."""
+def test_value_learns_mean_return():
+    """Two kinds of states, which differ in the goal. The returns of each kind vary about their mean."""
     near, far = jnp.array([3.0, 0.0]), jnp.array([0.0, 30.0])
     maps, proprio, _ = observations(4, 64)
     which = jnp.arange(64) % 2
@@ -83,7 +83,7 @@ def test_it_learns_the_mean_of_what_comes_after():
     np.testing.assert_allclose(value[which == 1], -2500.0, atol=30.0)
 
 
-def test_without_compilation_it_is_the_same(jit_disabled):
+def test_value_is_the_same_without_jit(jit_disabled):
     inputs = observations(5, 2)
     plain = apply(PARAMS, *inputs)
     with jax.disable_jit(False):

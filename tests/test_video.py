@@ -1,4 +1,4 @@
-"""Videos: MuJoCo draws what happened, in real time."""
+"""Videos: MuJoCo draws episodes in real time."""
 
 import os
 import resource
@@ -15,12 +15,12 @@ from ct_envs.robots import POINT, get_robot
 from ct_jax.report.video import SIZE, check_video, write_video
 
 av = pytest.importorskip("av")
-POSES = np.linspace([6.0, 6.0], [16.0, 6.0], 40, dtype=np.float32)  # of the point
+POSES = np.linspace([6.0, 6.0], [16.0, 6.0], 40, dtype=np.float32)  # poses of the point
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Where a video can be written, on a machine that can draw one."""
+    """A file for a video. The test is skipped if the machine has no OpenGL."""
     file = tmp_path / "walk.mp4"
     try:
         check_video(file)
@@ -35,13 +35,13 @@ def frames(file: Path) -> np.ndarray:
 
 
 def golden(image: np.ndarray) -> int:
-    """How many pixels are of the goal's colour."""
+    """The number of pixels with the colour of the goal."""
     red, green, blue = np.moveaxis(image.astype(int), -1, 0)
     return int(((red > 200) & (blue < 40) & (green > 150)).sum())
 
 
 @pytest.mark.parametrize("name", ["point", "ant", "humanoid"])
-def test_a_video_lasts_as_long_as_the_episode_and_follows_the_robot_to_its_goal(file: Path, name: str):
+def test_video_has_duration_of_episode_and_follows_robot(file: Path, name: str):
     robot = get_robot(name)
     model = build_model(robot)
     qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (40, 1)).astype(np.float32)
@@ -52,12 +52,12 @@ def test_a_video_lasts_as_long_as_the_episode_and_follows_the_robot_to_its_goal(
         seconds, title = container.duration / 1e6, container.metadata["title"]
     assert images.shape[1:] == (*SIZE, 3) and title == "a walk"
     assert seconds == pytest.approx(40 * robot.control_dt_s, rel=0.03)
-    assert golden(images[0]) == 0 < golden(images[-1])  # 12 m off it is out of sight
+    assert golden(images[0]) == 0 < golden(images[-1])  # at a distance of 12 m it is out of sight
     middle = images[:, SIZE[0] // 3 : -SIZE[0] // 3, SIZE[1] // 3 : -SIZE[1] // 3].astype(int)
     assert np.abs(middle[-1] - middle[0]).max() > 50  # of the robot, at least
 
 
-def test_what_cannot_be_written_is_told_in_a_line(tmp_path: Path):
+def test_unwritable_video_is_error_of_one_line(tmp_path: Path):
     (tmp_path / "folder.mp4").mkdir()
     wrong = {"walk.gif": r"give an \.mp4 file", "nowhere/walk.mp4": "No such file", "folder.mp4": "Is a directory"}
     for name, said in wrong.items():
@@ -65,7 +65,7 @@ def test_what_cannot_be_written_is_told_in_a_line(tmp_path: Path):
             check_video(tmp_path / name)
 
 
-def test_a_disk_that_is_full_in_the_end_keeps_no_half(file: Path):
+def test_full_disk_leaves_no_partial_video(file: Path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
     try:
@@ -77,8 +77,8 @@ def test_a_disk_that_is_full_in_the_end_keeps_no_half(file: Path):
 
 
 @pytest.mark.parametrize("name", ["point", "ant", "humanoid"])
-def test_the_floor_is_neither_black_nor_white(file: Path, name: str):
-    """In a large room, at the lower edge of the picture, there is nothing but the floor."""
+def test_floor_is_visible(file: Path, name: str):
+    """In a large room, the lower edge of the picture shows only the floor."""
     robot = get_robot(name)
     model = build_model(robot)
     qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (2, 1)).astype(np.float32)
@@ -92,7 +92,7 @@ def test_the_floor_is_neither_black_nor_white(file: Path, name: str):
 # ---------------------------------------------------------------------------------------------------------- OpenGL
 
 
-def test_a_machine_without_opengl_is_told_what_it_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_opengl_is_error_with_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for name, said in (("", "libegl1"), ("egl", "libegl1"), ("osmesa", "libosmesa6"), ("glfw", "needs a display")):
         monkeypatch.setenv("MUJOCO_GL", name)
         monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
@@ -111,7 +111,7 @@ def test_a_machine_without_opengl_is_told_what_it_lacks(tmp_path: Path, monkeypa
         ({"PYOPENGL_PLATFORM": "nonsense"}, "PYOPENGL_PLATFORM='nonsense': .*to be egl here; unset it"),
     ],
 )
-def test_variables_of_opengl_that_mean_nothing_are_told(tmp_path: Path, monkeypatch, variables: dict, said: str):
+def test_invalid_opengl_variables_are_error(tmp_path: Path, monkeypatch, variables: dict, said: str):
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
@@ -121,8 +121,8 @@ def test_variables_of_opengl_that_mean_nothing_are_told(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("name", ["egl", "osmesa"])
-def test_the_named_way_to_opengl_is_taken(file: Path, monkeypatch, name: str):
-    """In a process of its own: OpenGL is loaded once. Where this way is not installed, a line says so."""
+def test_named_opengl_backend_is_used(file: Path, monkeypatch, name: str):
+    """In a separate process, because OpenGL is loaded once. If the backend is not installed, there is an error."""
     monkeypatch.setenv("MUJOCO_GL", name)
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     code = f"""

@@ -1,4 +1,4 @@
-"""With JAX_ENABLE_X64=1 all is as without: what is drawn, what happens, and the 32 bits in which it is kept."""
+"""JAX_ENABLE_X64=1 does not change results: random draws, episodes, and 32-bit types are the same."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ PRM = PrmConfig(samples=40)
 
 @pytest.fixture
 def both():
-    """What a function gives without 64 bits and with them; both as NumPy."""
+    """The results of a function without and with 64 bits, as NumPy arrays."""
 
     def call(function):
         found = []
@@ -43,13 +43,13 @@ def both():
 
 
 def plain(leaf):
-    """An array, of a random key its numbers."""
+    """An array; a random key becomes its numbers."""
     leaf = jnp.asarray(leaf) if not isinstance(leaf, np.ndarray) else leaf
     return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf)
 
 
 def assert_alike(narrow, wide, *, atol: float = 1e-4) -> None:
-    """The same numbers in the same types."""
+    """Compare numbers and types."""
     assert jax.tree.structure(narrow) == jax.tree.structure(wide)
     for (path, a), b in zip(jax.tree.leaves_with_path(narrow), jax.tree.leaves(wide), strict=True):
         a, b = plain(a), plain(b)
@@ -60,7 +60,7 @@ def assert_alike(narrow, wide, *, atol: float = 1e-4) -> None:
 
 @pytest.mark.parametrize(("robot", "engine"), [(POINT, "mujoco"), (POINT, "mjx"), (ANT, "mujoco")])
 @pytest.mark.parametrize("auto_reset", [True, False])
-def test_environments(both, robot, engine, auto_reset):
+def test_environments_do_not_depend_on_x64(both, robot, engine, auto_reset):
     env = MazeEnv(robot, engine=engine, auto_reset=auto_reset, horizon=3)
     maze = load_maze("antmaze-umaze")
 
@@ -84,7 +84,7 @@ def happened(maze, method, **who):
 
 
 @pytest.mark.parametrize("method", ["planner", "explorer"])
-def test_guides(both, push, method):
+def test_guides_do_not_depend_on_x64(both, push, method):
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), method, controller=push())), atol=0.1)
 
 
@@ -100,14 +100,14 @@ def transformer(clip_target_return: bool = False) -> TransformerPolicy:
     )  # fmt: skip
 
 
-def test_the_transformer_acts(both):
-    policy = jax.device_get(transformer(clip_target_return=True))  # as a shipped model's: drawn without 64 bits
+def test_transformer_does_not_depend_on_x64(both):
+    policy = jax.device_get(transformer(clip_target_return=True))  # drawn without 64 bits, like a shipped model
     assert_alike(*both(lambda: happened(load_maze("antmaze-large"), "ct", policy=policy)), atol=1e-2)
 
 
 @pytest.mark.parametrize("options", [{}, {"relabel": 0.5, "mirror": True, "chain": True, "turn_ramp": (0.2, 0.6)}])
-def test_sac_updates(both, options):
-    """What is kept has the same types, and the random beginning is the same; brax's own draws differ afterwards."""
+def test_sac_does_not_depend_on_x64(both, options):
+    """The state has the same types, and the initial values are the same. Later draws of brax differ."""
     config = SacConfig(envs=4, iterations=8, updates=1, warmup=2, batch=8, hidden=(8,), replay=64, episode_steps=4)
     robot = ANT if options else POINT
     maze = load_maze("antmaze-umaze")
@@ -126,7 +126,7 @@ def test_sac_updates(both, options):
 
 
 @pytest.mark.parametrize("kind", ["transformer", "value"])
-def test_fit_updates(both, toy_data, kind):
+def test_fit_does_not_depend_on_x64(both, toy_data, kind):
     data = toy_data([9, 12], side_m=20.0)
     mazes = stack_mazes([load_maze("antmaze-umaze")])
     model = ControlTransformer(CONFIG, 2) if kind == "transformer" else ValueNetwork(4)
@@ -140,7 +140,7 @@ def test_fit_updates(both, toy_data, kind):
     assert_alike(*both(learn))
 
 
-def test_collection_and_recoveries(both, push):
+def test_collection_does_not_depend_on_x64(both, push):
     world = MazeWorld(MazeEnv(POINT, engine="mujoco", auto_reset=False), stack_mazes([load_maze("antmaze-umaze")] * 2))
     config = CollectConfig(trajectories=3, reset_interval=2, envs=4, horizon=200, noise=0.3)
     recovering = RecoverConfig(recoveries=1, stuck_steps=5, patience=10, takeover=0.1, keep="joined")

@@ -1,7 +1,7 @@
-"""The report of a run: one self-contained HTML page, and the gist of it as one PNG page.
+"""The report of a run: a self-contained HTML page, and a summary as one PNG picture.
 
-``reading`` takes whatever a run folder holds, finished or not; ``words`` says in sentences what it means;
-``pictures`` draws it; ``page`` and ``overview`` set it as HTML and as one picture.
+``reading`` reads a run folder, which may be unfinished. ``words`` writes the sentences, ``pictures`` draws, and
+``page`` and ``overview`` make the HTML page and the picture.
 """
 
 from pathlib import Path
@@ -16,13 +16,13 @@ __all__ = ["draw_maze", "draw_paths", "write_report"]
 
 
 def write_report(run: Path) -> Path:
-    """Write ``report.html`` and ``report.png`` into a run folder, from as many of its stages as are there.
+    """Write ``report.html`` and ``report.png`` into a run folder. Stages may be missing.
 
     Returns:
         The path of the HTML page.
 
     Raises:
-        UserError: ``run`` is no run folder, or cannot be written to.
+        UserError: ``run`` is not a run folder, or cannot be written to.
     """
     run = Path(run)
     html, png = run / "report.html", run / "report.png"

@@ -1,4 +1,4 @@
-"""The gist of a run as one picture: blocks from top to bottom, as many as there is something to show for."""
+"""The summary of a run as one picture: blocks from top to bottom. Blocks without data are left out."""
 
 import textwrap
 from collections.abc import Callable
@@ -22,24 +22,24 @@ _THIRD = (_INNER - 2 * 0.42) / 3
 _ROW = 0.25  # height of a line of the table
 _POINTS = 100_000  # of all paths in a maze
 
-Block = tuple[float, Callable[["Sheet", float], None]]  # height, and what draws it from its top down
+Block = tuple[float, Callable[["Sheet", float], None]]  # height, and a function that draws the block below a given top
 
 
 class Sheet:
-    """A figure addressed in inches from its upper left corner."""
+    """A figure with coordinates in inches from its upper left corner."""
 
     def __init__(self, height: float):
         self.height = height
         self.figure = Figure(figsize=(WIDTH, height), dpi=180, facecolor=LIGHT["card"])
 
     def axes(self, left: float, top: float, width: float, height: float) -> Axes:
-        """Axes whose upper left corner is there."""
+        """Axes with this upper left corner."""
         return self.figure.add_axes(
             (left / WIDTH, 1 - (top + height) / self.height, width / WIDTH, height / self.height)
         )
 
     def text(self, left: float, top: float, text: str, **how: Any) -> None:
-        """Text whose upper left corner is there."""
+        """Text with this upper left corner."""
         how = {"va": "top", "fontsize": 8.5, "color": LIGHT["ink"], "parse_math": False} | how
         self.figure.text(left / WIDTH, 1 - top / self.height, plain(text), **how)
 
@@ -64,7 +64,7 @@ def write_overview(run: Run, path: Path) -> None:
 
 
 def plain(text: str, most: int = 2000) -> str:
-    """Text that the one font matplotlib ships can draw."""
+    """Text with only those characters that matplotlib's font can draw."""
     text = text.replace(words.NARROW, "\N{THIN SPACE}")
     return "".join(c if c == "\n" or 32 <= ord(c) < 127 or c in "\u2009·–−" else "?" for c in text[:most])
 
@@ -142,7 +142,7 @@ def _table(run: Run) -> list[Block]:
 
 
 def _figures(row: dict[str, Any]) -> tuple[str, str, str, str]:
-    """Success, its interval, SPL and collisions, as text."""
+    """Success rate, its interval, SPL and collision rate, as text."""
 
     def show(key: str, how: Callable[[float], str]) -> str:
         value = number(row.get(key))
@@ -154,7 +154,7 @@ def _figures(row: dict[str, Any]) -> tuple[str, str, str, str]:
 
 
 def _paths(run: Run) -> list[Block]:
-    """The main method's paths in the first seen and the first unseen maze, or in the two rooms it failed most in."""
+    """The main method's paths in the first seen and the first unseen maze, or in the two worst rooms."""
     mine = [e for e in run.episodes if e.method == words.main_method(run) and e.maze in run.walls]
     if words.in_rooms(run.rows):
         mine = sorted(mine, key=lambda e: int(e.success.sum()) - len(e.success))
@@ -220,7 +220,7 @@ def _last_row(run: Run) -> list[Block]:
             sheet.text(
                 MARGIN,
                 top,
-                f"Return asked for, return got: {_short(e.maze, 18)}",
+                f"Target and actual return: {_short(e.maze, 18)}",
                 fontsize=8,
                 fontweight="bold",
             )
@@ -234,12 +234,12 @@ def _last_row(run: Run) -> list[Block]:
 
 
 def _draw_times(sheet: Sheet, left: float, top: float, times: list[tuple[str, float]]) -> None:
-    """Bars of the stages' times."""
+    """Bars of the times of the stages."""
     if not times:
         return
     longest = max(time for _, time in times) or 1.0
     total = sum(time for _, time in times)
-    sheet.text(left, top, f"Time by stage: {words.duration(total)} together", fontsize=8, fontweight="bold")
+    sheet.text(left, top, f"Time per stage: {words.duration(total)} in total", fontsize=8, fontweight="bold")
     for i, (stage, time) in enumerate(times):
         here = top + 0.28 + i * _ROW
         sheet.text(left, here, words.stage_label(stage, timing=True), fontsize=8)

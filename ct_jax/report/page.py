@@ -1,7 +1,7 @@
-"""The HTML page: each part is one function from a run to HTML, and says in a line what it misses.
+"""The HTML page. Each part is a function from a run to HTML, and names the files that are missing.
 
-The page needs no script and nothing from outside: pictures are inline SVG whose colours follow light and dark
-mode. All text that comes from files is escaped.
+The page has no scripts and loads nothing. Pictures are inline SVG, with colours for light and dark mode. All text from
+files is escaped.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,13 +20,13 @@ from ct_jax.report.pictures import LIGHT
 from ct_jax.report.reading import METHODS, STAGES, Curve, Episodes, Run, number
 from ct_jax.terminal import printable
 
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # not even a browser looks outside
-MOST_MAZES = 12  # mazes drawn
-MOST_FAILURES = 8  # failures in the gallery
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # forbids the browser to load anything
+MOST_MAZES = 12  # maximum number of mazes that are drawn
+MOST_FAILURES = 8  # maximum number of failures that are drawn singly
 MOST_SUCCESSES = 4
-MOST_POINTS = 360_000  # points of all paths on the page, so that it stays below 5 MB
-MOST_DOTS = 400  # episodes in a scatter
-MOST_LISTED = 200  # failures in one list
+MOST_POINTS = 360_000  # maximum number of points of all paths, so that the page is smaller than 5 MB
+MOST_DOTS = 400  # maximum number of episodes in a scatter plot
+MOST_LISTED = 200  # maximum number of failures in one list
 
 _COLUMNS: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
     ("Success", "success_rate", "success_ci95", words.percent),
@@ -41,20 +41,20 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
     ("Mean steps", "steps_mean", "steps_ci95", lambda x: words.decimal(x, 0)),
 )
 _GLOSSARY = {
-    "Success": "share of episodes that reached the goal in time; small figures are 95 % intervals",
-    "SPL": "success weighted by path length: 1 is the shortest way, always",
-    "Scaled return": "minus the distance to the goal, summed over all steps, over 100; nearer to 0 is better",
-    "Collisions": "share of episodes in which the robot touched something at least once",
-    "Frontal": "share of episodes in which it ran into something ahead of it",
-    "Grazing": "share of episodes in which it touched something with its side",
-    "Falls": "share of episodes that ended with the robot on its side or back",
-    "Diverged": "share of episodes that ended because a state or an action was not a finite number",
+    "Success": "share of episodes that reached the goal in time; the small numbers are 95 % intervals",
+    "SPL": "success weighted by path length: 1 means the shortest path in every episode",
+    "Scaled return": "minus the distance to the goal, summed over all steps, divided by 100; higher is better",
+    "Collisions": "share of episodes in which the robot touched something",
+    "Frontal": "share of episodes with a contact at the front of the robot",
+    "Grazing": "share of episodes with a contact at the side of the robot",
+    "Falls": "share of episodes that ended with a fall",
+    "Diverged": "share of episodes that ended because a state or an action was not finite",
     "Time-outs": "share of episodes that did not reach the goal in time",
 }
-CURVES = {  # what is drawn of a stage: the scalar, what it is, and how it is drawn
+CURVES = {  # the curves of a stage: the scalar, its description, and the options of ``draw_curve``
     "controller": (
         ("success", "success on edges", {"rate": True}),
-        ("held_out", "success on held-out edges, without chance", {"rate": True}),
+        ("held_out", "success on held-out edges, without exploration noise", {"rate": True}),
         ("reward", "reward", {}),
     ),
     "value": (("loss", "loss", {"log": True}),),
@@ -102,7 +102,7 @@ def _variables() -> str:
 
 
 def _text(value: Any) -> str:
-    """Any value as text that is safe in HTML, and on a terminal that shows it."""
+    """Any value as text that is safe in HTML and on a terminal."""
     return escape(printable(value))
 
 
@@ -119,7 +119,7 @@ def _grid(figures: list[str], kind: str = "") -> str:
 
 
 def _figure(svg: str, title: str, note: str = "", tag: str = "") -> str:
-    """A picture below its caption. ``title`` and ``note`` are plain text, ``tag`` is HTML."""
+    """A picture with a caption above it. ``title`` and ``note`` are plain text, ``tag`` is HTML."""
     note = f"<span>{_text(note)}</span>" if note else ""
     return f"<figure><figcaption><b>{_text(title)}</b>{tag}{note}</figcaption>{svg}</figure>"
 
@@ -159,7 +159,7 @@ def _date(created: Any) -> str:
 
 
 def _results(run: Run) -> str:
-    title = "Does it reach its goals?"
+    title = "Success"
     if not run.rows:
         return _section(title, _missing("No evaluation yet", "evaluate/results.json"))
     mazes = list(dict.fromkeys(row["maze"] for row in run.rows))
@@ -173,7 +173,7 @@ def _results(run: Run) -> str:
 
 
 def _columns(run: Run) -> list[tuple[str, str, str, Callable[[float], str]]]:
-    """The columns of the tables: contacts are told apart for some robots only, and hardly ever an episode diverges."""
+    """The columns of the tables. Columns for contacts and for diverged episodes are shown only if they have data."""
 
     def shown(key: str) -> bool:
         if key in ("frontal_rate", "grazing_rate"):
@@ -197,7 +197,7 @@ def _table(run: Run, maze: str, rows: list[dict[str, Any]]) -> str:
 
 
 def _row(run: Run, row: dict[str, Any], *, several: bool) -> str:
-    """One method in one maze, its name above its figures. With ``several`` seeds, it says which."""
+    """One method in one maze: its name, and its numbers below. The name contains the seed if there are ``several``."""
     label = words.method_label(row["method"]) + (f" (seed {row.get('seed')})" if several else "")
     cells = "".join(_cell(row, name, key, interval, show) for name, key, interval, show in _columns(run))
     first = ' class="first"' if row["method"] == words.main_method(run) else ""
@@ -206,7 +206,7 @@ def _row(run: Run, row: dict[str, Any], *, several: bool) -> str:
 
 
 def _cell(row: dict[str, Any], name: str, key: str, interval: str, show: Callable[[float], str]) -> str:
-    """A figure, its 95 % interval below it, and for the success rate a bar of both."""
+    """A number with its 95 % interval below; for the success rate also a bar of both."""
     value = number(row.get(key))
     if value is None:
         return f'<td class="none" data-label="{name}">{words.DASH}</td>'
@@ -239,21 +239,21 @@ def _mazes(run: Run) -> str:
             note = " with a roadmap of {} and {}".format(*parts)
         svg = pictures.to_svg(figure, f"{'' if rooms else 'Maze '}{name}, {size}{note}.")
         figures.append(_figure(svg, name, size + note, _seen_tag(run.seen.get(name, False))))
-    lead = "The planner knows these maps. The transformer never sees one: only the walls around it."
+    lead = "The planner knows these maps. The transformer sees only the walls near the robot."
     if besides := _random_mazes(run):
-        lead += f" It was trained in {words.count(besides, 'random maze')} besides."
+        lead += f" It was also trained in {words.count(besides, 'random maze')}."
     if besides := _random_mazes(run, "recover"):
-        lead += f" It looked for its failures in {words.count(besides, 'random maze')}, too."
+        lead += f" Recoveries were also collected in {words.count(besides, 'random maze')}."
     lead = f'<p class="quiet">{lead}</p>'
     more = len(run.walls) - len(figures)
-    rest = f'<p class="quiet">{words.count(more, "further " + ("room" if rooms else "maze"))} not drawn.</p>'
+    rest = f'<p class="quiet">{words.count(more, "other " + ("room" if rooms else "maze"))} not drawn.</p>'
     rest = rest if more else ""
     missing = "" if run.roadmap or rooms else _missing("No roadmap", "prm/roadmap.npz")
     return _section(title, lead, _grid(figures, "wide"), rest, missing)
 
 
 def _random_mazes(run: Run, *stage: str) -> int:
-    """How many random mazes a run's settings, or those of a stage of it, name; damaged ones name none."""
+    """The number of random mazes in the settings of a run, or in a group of its settings; 0 if they are damaged."""
     found: object = run.config.get("settings")
     for key in (*stage, "random_mazes"):
         found = found.get(key) if isinstance(found, dict) else None
@@ -261,14 +261,14 @@ def _random_mazes(run: Run, *stage: str) -> int:
 
 
 def _trajectories(run: Run) -> str:
-    title = "Where it went"
+    title = "Paths"
     drawn = [episodes for episodes in run.episodes if episodes.maze in run.walls]
     if not drawn:
         return _section(title, _missing("No trajectories", "evaluate/*.npz"))
     parts = [_key()]
     for method in dict.fromkeys(episodes.method for episodes in drawn):
         mine = [e for e in drawn if e.method == method]
-        if len(mine) > MOST_MAZES:  # those with the most failures
+        if len(mine) > MOST_MAZES:  # keep those with the most failures
             mine = sorted(mine, key=lambda e: int(e.success.sum()) - len(e.success))[:MOST_MAZES]
         figures = [_paths_figure(run, e, MOST_POINTS // len(drawn)) for e in mine]
         parts.append(f"<h3>{_text(words.method_label(method))}</h3>{_grid(figures, 'wide')}")
@@ -276,7 +276,7 @@ def _trajectories(run: Run) -> str:
 
 
 def _paths_figure(run: Run, episodes: Episodes, most: int) -> str:
-    """All paths of one method in one maze, or as many as ``most`` points allow, failures first."""
+    """The paths of one method in one maze. At most about ``most`` points are drawn, failures first."""
     n, reached = len(episodes.success), int(episodes.success.sum())
     chosen = pictures.choose(episodes.path, episodes.success, episodes.steps, episodes.start, most)
     failed = f"{n - reached} failed" if reached < n else "none failed"
@@ -289,7 +289,7 @@ def _paths_figure(run: Run, episodes: Episodes, most: int) -> str:
 
 
 def _paths_svg(run: Run, episodes: Episodes, chosen: np.ndarray, alt: str, *, alone: bool = False) -> str:
-    """A maze and the chosen episodes in it; one ``alone`` is drawn bolder."""
+    """A maze and the chosen episodes in it. A single episode (``alone``) has thicker lines."""
     walls = run.walls[episodes.maze]
     figure, ax = pictures.maze_figure(walls, 2.9 if alone else 5.2)
     pictures.draw_maze(ax, walls, run.cell_m)
@@ -300,7 +300,7 @@ def _paths_svg(run: Run, episodes: Episodes, chosen: np.ndarray, alt: str, *, al
 
 
 def _key() -> str:
-    """What the marks and colours of a path mean."""
+    """The legend of the marks and colours of paths."""
 
     def ramp(name: str, text: str) -> str:
         colours = ", ".join(f"var(--{name}{level})" for level in range(pictures.LEVELS))
@@ -321,7 +321,7 @@ def _key() -> str:
 
 
 def _failure_list(run: Run, episodes: Episodes) -> str:
-    """Every failure of one method in one maze, folded away."""
+    """A list of all failures of one method in one maze. It is collapsed at first."""
     failures = np.flatnonzero(~episodes.success)
     if not len(failures):
         return ""
@@ -352,17 +352,17 @@ def _gallery(run: Run) -> str:
     failures = [_single(run, episodes, i) for episodes, i in _pick_failures(run, mine)]
     successes = [_single(run, episodes, i) for episodes, i in _pick_successes(mine)]
     failed = sum(int((~episodes.success).sum()) for episodes in mine)
-    some = f"{len(failures)} of its {failed} failures" if len(failures) < failed else "all its failures"
-    parts = [f"<h3>{some[0].upper() + some[1:]}</h3>" + _grid(failures, "small")] if failures else []
+    some = f"{len(failures)} of {failed} failures" if len(failures) < failed else "All failures"
+    parts = [f"<h3>{some}</h3>" + _grid(failures, "small")] if failures else []
     if not failures:
-        parts.append(f'<p class="quiet">The {label} has no failure to show.</p>')
-    parts += [f"<h3>Some of its successes</h3>{_grid(successes, 'small')}"] if successes else []
+        parts.append(f'<p class="quiet">The {label} has no failures.</p>')
+    parts += [f"<h3>Some successes</h3>{_grid(successes, 'small')}"] if successes else []
     lists = (_failure_list(run, episodes) for episodes in run.episodes)
-    return _section(f"One by one: {label}", *parts, *lists)
+    return _section(f"Single episodes: {label}", *parts, *lists)
 
 
 def _single(run: Run, episodes: Episodes, i: int) -> str:
-    """One episode in a picture of its own."""
+    """A picture of one episode."""
     failed = not episodes.success[i]
     reached = f"reached in {words.count(int(episodes.steps[i]), 'step')}"
     what = words.failure_text(run, episodes, i) if failed else reached
@@ -373,7 +373,7 @@ def _single(run: Run, episodes: Episodes, i: int) -> str:
 
 
 def _pick_failures(run: Run, mine: list[Episodes]) -> list[tuple[Episodes, int]]:
-    """Failures of every kind in every maze in turn, those in unseen mazes first."""
+    """Failures of all kinds in all mazes in turn, unseen mazes first."""
     kinds: dict[tuple[str, str], list[tuple[Episodes, int]]] = {}
     for episodes in sorted(mine, key=lambda e: e.seen):
         for i in map(int, np.flatnonzero(~episodes.success)):
@@ -383,7 +383,7 @@ def _pick_failures(run: Run, mine: list[Episodes]) -> list[tuple[Episodes, int]]
 
 
 def _pick_successes(mine: list[Episodes]) -> list[tuple[Episodes, int]]:
-    """Successes of each maze in turn, from long to short, those in unseen mazes first."""
+    """Successes of all mazes in turn, from long to short, unseen mazes first."""
 
     def spread(episodes: Episodes) -> Iterator[tuple[Episodes, int]]:
         reached = np.flatnonzero(episodes.success)
@@ -399,7 +399,7 @@ def _pick_successes(mine: list[Episodes]) -> list[tuple[Episodes, int]]:
 
 
 def curves_of(run: Run) -> Iterator[tuple[str, str, Curve, dict[str, bool]]]:
-    """The learning curves to draw: stage, what it is, the curve, and how ``draw_curve`` draws it."""
+    """The learning curves to draw: stage, description, curve, and options of ``draw_curve``."""
     for stage, named in run.curves.items():
         wanted = CURVES.get(stage.partition("-")[0], _ANY_CURVE)
         for name, what, how in wanted:
@@ -408,7 +408,7 @@ def curves_of(run: Run) -> Iterator[tuple[str, str, Curve, dict[str, bool]]]:
 
 
 def _curves(run: Run) -> str:
-    title = "How it learned"
+    title = "Learning curves"
     figures = []
     for stage, what, curve, how in curves_of(run):
         figure, ax = pictures.plot_figure()
@@ -424,7 +424,7 @@ def _curves(run: Run) -> str:
 
 
 def _calibration(run: Run) -> str:
-    title = "Return asked for, return got"
+    title = "Target return and actual return"
     figures = []
     for episodes in run.tested:
         if episodes.asked is None or episodes.returns is None:
@@ -434,16 +434,17 @@ def _calibration(run: Run) -> str:
         pictures.draw_calibration(ax, episodes.asked[some], episodes.returns[some], episodes.success[some])
         note = words.calibration_text(episodes.asked, episodes.returns)
         name = f"{episodes.maze}" + ("" if episodes.method == "ct" else f", {words.method_label(episodes.method)}")
-        svg = pictures.to_svg(figure, f"Return asked for against return got, {name}: {note}.")
+        svg = pictures.to_svg(figure, f"Actual return against target return, {name}: {note}.")
         figures.append(_figure(svg, name, note, _seen_tag(episodes.seen)))
     if not figures:
-        return _section(title, _missing("No returns asked for", "evaluate/*-ct.npz"))
-    lead = "The value network asks for a return at the start; on the dashed line it got that. Crosses failed."
+        return _section(title, _missing("No target returns", "evaluate/*-ct.npz"))
+    lead = "The value network predicts the target return at the start. On the dashed line, both returns are equal. "
+    lead += "Crosses are failures."
     return _section(title, f'<p class="quiet">{lead}</p>', _grid(figures))
 
 
 def _stages(run: Run) -> str:
-    title = "What took how long"
+    title = "Time per stage"
     times = {stage: number(done.get("wall_s")) or 0.0 for stage, done in run.done.items()}
     if not times:
         return _section(title, _missing("No finished stage", "*/done.json"))
@@ -452,7 +453,7 @@ def _stages(run: Run) -> str:
         _stage(words.stage_label(stage, timing=True), words.stage_facts(run.done[stage]), time, time / longest)
         for stage, time in times.items()
     )
-    total = _stage("Together", "", sum(times.values()), 0.0)
+    total = _stage("Total", "", sum(times.values()), 0.0)
     table = f'<div class="card"><table class="stages"><tbody>{rows}</tbody><tfoot>{total}</tfoot></table></div>'
     absent = [words.stage_label(stage) for stage in STAGES if stage not in run.done]
     note = f'<p class="missing">Not finished, or not part of this run: {", ".join(absent)}.</p>' if absent else ""
@@ -460,7 +461,7 @@ def _stages(run: Run) -> str:
 
 
 def _stage(name: str, facts: str, time: float, share: float) -> str:
-    """A stage, what it says of itself, and its time as a bar and in words."""
+    """A row with a stage, its facts, and its time as a bar and as text."""
     bar = f'<i style="--share:{100 * share:.1f}%"></i>' if share else ""
     return (
         f'<tr><th scope="row">{_text(name)}</th><td>{_text(facts)}</td>'

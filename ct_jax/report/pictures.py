@@ -1,10 +1,9 @@
-"""Pictures of mazes, paths and curves: matplotlib axes in, and PNG or theme-aware inline SVG out.
+"""Pictures of mazes, paths and curves, drawn with matplotlib: PNG, or inline SVG for light and dark mode.
 
-Everything is drawn once, in the colours of ``LIGHT``. ``to_svg`` then replaces each colour by a CSS
-variable of its name, so that one picture in a page is right in light and in dark mode, on paper and at any
-size. Success is a ramp of blues and failure one of oranges, over time, which colour-blind readers tell
-apart; a cross marks where a failure ended. Only matplotlib's object interface is used: no global figure, no
-global settings.
+All pictures are drawn in the colours of ``LIGHT``. ``to_svg`` replaces each colour by a CSS variable, so that the same
+picture can be shown in light mode, in dark mode and on paper. Paths of successes change from light to dark blue over
+time, and those of failures from light to dark orange. Colour-blind readers can distinguish these. A cross marks the end
+of a failure. The code uses only matplotlib's object interface: no global figure and no global settings.
 """
 
 import re
@@ -33,7 +32,7 @@ from ct_jax.terminal import printable
 if TYPE_CHECKING:
     from ct_jax.evaluate import Episodes
 
-LEVELS = 8  # steps of the time ramps
+LEVELS = 8  # number of colours of a path over time
 LIGHT = {
     "ink": "#1a2430", "muted": "#5c6977", "rule": "#d9dfe6", "page": "#f4f6f8", "card": "#ffffff",
     "floor": "#fbfcfe", "wall": "#c2cbd6", "roadmap": "#7f8fa3", "accent": "#1b6ca8", "trace": "#9dc3e0",
@@ -53,10 +52,10 @@ DARK = {
     "f5": "#f49453", "f6": "#faad72", "f7": "#fdc898",
 }  # fmt: skip
 _NAMES = {colour: name for name, colour in LIGHT.items()}
-_MOST_RUNS = 4000  # wall runs drawn as outlines; a larger maze becomes an image
-_HIDDEN = 0.6  # of a cell: how much of the outer ring of walls is cut off, for it says nothing
-_OUTLIER = 4.0  # times the range of the middle half: farther from it is an outlier
-_PIECES = 250  # pieces a path is cut into for each crossing of the maze
+_MOST_RUNS = 4000  # maximum number of wall runs drawn as outlines; a larger maze is drawn as an image
+_HIDDEN = 0.6  # share of a cell that is cut off at the border: the outer walls carry no information
+_OUTLIER = 4.0  # an outlier is farther from the middle half than this many times its range
+_PIECES = 250  # number of segments of a path that crosses the maze once
 
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none", "path.simplify": True, "path.simplify_threshold": 0.3, "text.usetex": False,
@@ -71,15 +70,15 @@ _STYLE: dict[Any, Any] = {
 
 
 def style():
-    """A context in which matplotlib draws in this module's style; the caller's settings return afterwards."""
+    """A context with this module's matplotlib style. It restores the caller's settings afterwards."""
     return matplotlib.rc_context(_STYLE)
 
 
 def to_svg(figure: Figure, alt: str) -> str:
-    """The figure as one ``<svg>`` element for an HTML page: coloured by CSS variables, with ``alt`` text."""
+    """The figure as an ``<svg>`` element for an HTML page. Its colours are CSS variables; ``alt`` describes it."""
     stream = StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    salted: dict[Any, Any] = _STYLE | {"svg.hashsalt": ascii(alt)}  # keeps ids apart in a page, and runs alike
+    salted: dict[Any, Any] = _STYLE | {"svg.hashsalt": ascii(alt)}  # unique ids in a page, the same in every run
     with matplotlib.rc_context(salted):
         figure.savefig(stream, format="svg", metadata=nothing, dpi=200)
     text = stream.getvalue()
@@ -96,7 +95,7 @@ def to_svg(figure: Figure, alt: str) -> str:
 
 
 def _compact(outline: str) -> str:
-    """Path data as steps of tenths of a point, half as long; curves stay as they are."""
+    """Path data in relative steps with a resolution of 0.1 points, to halve its length. Curves are not changed."""
     if re.search("[CQ]", outline):
         return outline
     kept, x, y = [], 0, 0
@@ -121,13 +120,13 @@ def _font_size(hit: re.Match[str]) -> str:
 
 
 def maze_figure(walls: Place, width_in: float = 5.2) -> tuple[Figure, Axes]:
-    """A figure that a maze of this shape, or a room, fills, and its axes."""
+    """A figure with the aspect ratio of a maze or a room, and its axes."""
     figure = Figure(figsize=(width_in, width_in * float(np.clip(aspect(walls), 0.15, 1.6))))
     return figure, figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
 
 def aspect(walls: Place) -> float:
-    """Height over width of a maze or a room as it is drawn."""
+    """Height divided by width of the picture of a maze or a room."""
     if isinstance(walls, World):
         return 1.0
     height, width = (side - 2 * _HIDDEN for side in walls.shape)
@@ -135,7 +134,7 @@ def aspect(walls: Place) -> float:
 
 
 def draw_maze(ax: Axes, walls: Place, cell_m: float = 4.0) -> None:
-    """Draw a maze, row 0 lowest, or a room, in metres, and set the axes to it without ticks or frame."""
+    """Draw a maze (row 0 at the bottom) or a room in metres. Sets the limits of the axes; hides ticks and frame."""
     if isinstance(walls, World):
         _draw_room(ax, walls)
         return
@@ -146,7 +145,7 @@ def draw_maze(ax: Axes, walls: Place, cell_m: float = 4.0) -> None:
     runs = _wall_runs(walls)
     if len(runs) <= _MOST_RUNS:
         outline = Outline.make_compound_path(*(_box(column, row, length, cell_m) for row, column, length in runs))
-        # a thin edge of the same colour closes the hairlines between neighbours
+        # A thin edge of the same colour hides the gaps between neighbours.
         ax.add_patch(PathPatch(outline, facecolor=LIGHT["wall"], edgecolor=LIGHT["wall"], linewidth=0.5, zorder=1))
     else:
         grey = np.where(walls[..., None], np.array([0.5, 0.55, 0.6, 0.55]), 0.0)
@@ -209,17 +208,17 @@ def draw_paths(
 ) -> None:
     """Draw episodes over ``draw_maze``.
 
-    Colour runs with each episode's own time, through blues for a success and through oranges for a failure. A dot
-    is a start, a star a goal, and a cross the place where a failure ended. ``path`` holds the positions [m] after
-    each step; what comes after an episode's ``steps`` is ignored.
+    Colours show the time in each episode: blue for a success, orange for a failure. A dot is a start, a star is a
+    goal, and a cross is the end of a failure. ``path`` holds the positions [m] after each step. Positions after an
+    episode's ``steps`` are ignored.
 
     Args:
-        size: of the markers, 1 for a crowd.
+        size: scale of the markers; 1 is suitable for many episodes.
     """
     success = np.asarray(success, bool)
     tracks = [track(path, steps, start, i) for i in range(len(success))]
     spacing = _spacing(tracks)
-    # failures below: one that circles for a thousand steps would hide all else, and its cross stays on top
+    # Draw failures below successes: a robot that circles for a thousand steps would hide them. Crosses are on top.
     for ramp, chosen, zorder, weight in (
         ("f", ~success, 2, 0.75 if success.any() else 1.0),
         ("t", success, 3, 1.0),
@@ -241,7 +240,7 @@ def draw_paths(
 
 
 def write_paths(file: Path, walls: Place, episodes: "Episodes", title: str) -> None:
-    """Write a picture of a maze, or a room, and all episodes in it, in the format that the file's name says."""
+    """Write a picture of a maze or a room with all episodes. The suffix of the file gives the format."""
     width, top, bottom = 5.2, 0.3, 0.42
     height = width * aspect(walls)
     whole_height = top + height + bottom
@@ -258,7 +257,7 @@ def write_paths(file: Path, walls: Place, episodes: "Episodes", title: str) -> N
 
 
 def _add_legend(figure: Figure, reached: bool, failed: bool) -> None:
-    """Say below a picture of paths what its marks and colours mean, as far as they are in it."""
+    """Add a legend of the marks and colours that occur in a picture of paths."""
 
     def mark(marker: str, colour: str, size: float, edge: str) -> Line2D:
         how = {"markeredgecolor": LIGHT[edge], "markeredgewidth": 0.4}
@@ -280,7 +279,7 @@ def _add_legend(figure: Figure, reached: bool, failed: bool) -> None:
 
 
 def _spacing(tracks: list[np.ndarray]) -> float:
-    """Distance [m] between the points that tracks are drawn with."""
+    """Distance [m] between the drawn points of tracks."""
     return float(np.ptp(np.concatenate(tracks), axis=0).max()) / _PIECES or 1.0
 
 
@@ -296,14 +295,14 @@ def choose(
 
 
 def track(path: np.ndarray, steps: np.ndarray, start: np.ndarray, i: int) -> Float[np.ndarray, "k 2"]:
-    """Positions [m] of episode ``i`` from its start to where it ended, without values that are not finite."""
+    """Positions [m] of episode ``i`` from its start to its end, without values that are not finite."""
     whole = np.concatenate([np.asarray(start)[None, i], path[: int(steps[i]), i]]).astype(np.float64)
     whole = whole[np.isfinite(whole).all(1)]
     return whole if len(whole) else np.zeros((1, 2))
 
 
 def resample(points: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """The same way in equal lengths of about ``spacing``, and the time (0 to 1) at each of its points."""
+    """The same path with points at equal distances of about ``spacing``, and the time (0 to 1) at each point."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     n = int(np.clip(np.ceil(way[-1] / spacing) + 1, 2, 4 * _PIECES))
     grid = np.linspace(0.0, way[-1], n)
@@ -312,7 +311,7 @@ def resample(points: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _piece(time: np.ndarray, level: int) -> slice:
-    """The points of one level of a ramp and the first of the next, so that pieces meet."""
+    """The points of one colour and the first point of the next colour, so that the lines are connected."""
     low, high = np.searchsorted(time, (level / LEVELS, (level + 1) / LEVELS))
     return slice(low, high + 1 if high > low else low)
 
@@ -320,7 +319,7 @@ def _piece(time: np.ndarray, level: int) -> slice:
 def _stroke(
     ax: Axes, lines: Iterable[np.ndarray], colour: str, *, linewidth: float, alpha: float, zorder: float
 ) -> None:
-    """Draw many lines as one outline: a hundred paths cost a page no more than their points."""
+    """Draw many lines as one outline, which keeps the page small."""
     kept = [line for line in lines if len(line) > 1]
     if not kept:
         return
@@ -329,25 +328,25 @@ def _stroke(
         Outline(np.concatenate(kept), codes), facecolor="none", edgecolor=colour, linewidth=linewidth,
         alpha=alpha, capstyle="round", joinstyle="round", zorder=zorder,
     )  # fmt: skip
-    ax.add_artist(patch)  # unlike add_patch, it does not go through all points for the axes' limits
+    ax.add_artist(patch)  # faster than add_patch, which computes the limits of the axes from all points
 
 
 # ---------------------------------------------------------------------------------------- curves and scatters
 
 
 def plot_figure(width_in: float = 2.9, height_in: float = 1.9) -> tuple[Figure, Axes]:
-    """A figure with one pair of axes for a curve or a scatter."""
+    """A figure with axes for a curve or a scatter plot."""
     with style():
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         return figure, figure.add_subplot()
 
 
 def draw_curve(ax: Axes, step: np.ndarray, value: np.ndarray, *, rate: bool = False, log: bool = False) -> None:
-    """Draw a learning curve: the values faint, and their running mean.
+    """Draw a learning curve: the values in a light colour, and their running mean.
 
     Args:
-        rate: the values are fractions, shown as per cent from 0 to 100.
-        log: logarithmic values (ignored unless all are positive).
+        rate: the values are fractions; they are shown in percent from 0 to 100.
+        log: use a logarithmic axis if all values are positive and differ by more than a factor of 10.
     """
     value = 100 * value if rate else value
     smooth = running_mean(value)
@@ -370,7 +369,7 @@ def draw_curve(ax: Axes, step: np.ndarray, value: np.ndarray, *, rate: bool = Fa
 
 
 def running_mean(values: np.ndarray) -> np.ndarray:
-    """Mean over a tenth of the values around each, over fewer near the ends."""
+    """Mean over a window of a tenth of the values. Near the ends the window is shorter."""
     reach = len(values) // 20
     total = np.concatenate([[0.0], np.cumsum(values)])
     at = np.arange(len(values))
@@ -379,9 +378,9 @@ def running_mean(values: np.ndarray) -> np.ndarray:
 
 
 def draw_calibration(ax: Axes, asked: np.ndarray, got: np.ndarray, success: np.ndarray) -> None:
-    """Scatter the return an episode was asked for against what it got; on the line, the promise was kept.
+    """Scatter plot of the actual return (``got``) against the target return (``asked``) of episodes, with the diagonal.
 
-    Outliers would leave no room for all others: they are put on the edge, hollow and counted.
+    Outliers are drawn hollow at the edge, so that they do not compress the scale; their number is shown.
     """
     low, high = bulk(np.concatenate([asked, got]))
     margin = 0.05 * (high - low) or 1.0
@@ -398,14 +397,16 @@ def draw_calibration(ax: Axes, asked: np.ndarray, got: np.ndarray, success: np.n
     if n := int(beyond.sum()):
         where = {"transform": ax.transAxes, "ha": "right", "va": "bottom", "fontsize": 7, "color": LIGHT["muted"]}
         ax.text(0.98, 0.03, f"hollow: {n} beyond the axes", **where)
-    ax.set(xlim=(low, high), ylim=(low, high), xlabel="return asked for", ylabel="return got", aspect="equal")
+    ax.set(xlim=(low, high), ylim=(low, high), xlabel="target return", ylabel="actual return", aspect="equal")
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.yaxis.set_major_locator(MaxNLocator(4))
 
 
 def bulk(values: np.ndarray) -> tuple[float, float]:
-    """The least and the greatest of the values that are no outliers: those within four times the range of the middle
-    half around it."""
+    """Minimum and maximum of the values without outliers.
+
+    An outlier is farther from the middle half of the values than four times the range of that half.
+    """
     first, third = np.percentile(values, [25, 75])
     reach = _OUTLIER * (third - first)
     inside = values[(values >= first - reach) & (values <= third + reach)] if reach else values

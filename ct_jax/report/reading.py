@@ -1,4 +1,4 @@
-"""Reading a run folder: what is there, as arrays and plain values; what is missing or torn, as nothing."""
+"""Reading a run folder as arrays and plain values. Missing or damaged files are read as empty."""
 
 import json
 import re
@@ -17,16 +17,16 @@ from ct_envs.maze import CELL_M, parse_walls
 from ct_envs.turtlebot3_world import World, make_world
 
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate")
-METHODS = ("ct", "planner", "explorer")  # the order they are shown in; others follow
-ROOMS = "rooms"  # all rooms of an evaluation together, as its files call them
-_ROOM_CELL_M = 0.5  # in rooms, what counts as one spot [m]
+METHODS = ("ct", "planner", "explorer")  # order in the report; other methods follow
+ROOMS = "rooms"  # the name of all rooms of an evaluation in its files
+_ROOM_CELL_M = 0.5  # in rooms, a robot that moves less than this is stuck [m]
 
 Place = np.ndarray | World  # the walls of a maze [H, W], or a room
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """What one method did in one maze."""
+    """The episodes of one method in one maze."""
 
     maze: str
     method: str
@@ -38,8 +38,8 @@ class Episodes:
     start: Float[np.ndarray, "n 2"]
     goal: Float[np.ndarray, "n 2"]
     returns: Float[np.ndarray, "n"] | None
-    asked: Float[np.ndarray, "n"] | None  # return asked for at the start
-    room: Int[np.ndarray, "n"] | None = None  # number of the room of each episode
+    asked: Float[np.ndarray, "n"] | None  # target return at the start
+    room: Int[np.ndarray, "n"] | None = None  # index of the room of each episode
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ class Curve:
 
 @dataclass(frozen=True)
 class Run:
-    """All that a report shows. Empty where a stage is missing."""
+    """The contents of a report. Fields of missing stages are empty."""
 
     folder: Path
     config: dict[str, Any]
     cell_m: float
-    walls: dict[str, Place]  # mazes, the training ones first, or rooms
+    walls: dict[str, Place]  # mazes (training mazes first) or rooms
     seen: dict[str, bool]
     rows: list[dict[str, Any]]  # of evaluate/results.json, seen mazes first, methods in order
-    tested: list[Episodes]  # likewise
-    episodes: list[Episodes]  # the same, but for rooms, each of which is by itself
+    tested: list[Episodes]  # in the same order
+    episodes: list[Episodes]  # like ``tested``, but the rooms are separate
     curves: dict[str, dict[str, Curve]]  # by stage and name
-    horizon: int  # steps of the longest episode: when time runs out
+    horizon: int  # number of steps of the longest episode
     roadmap: tuple[np.ndarray, np.ndarray] | None  # points [n, 2] (m), edges [m, 2]
     done: dict[str, dict[str, Any]]  # by stage
 
@@ -72,7 +72,7 @@ def read_run(folder: Path) -> Run:
     """Read a run folder.
 
     Raises:
-        UserError: there is no folder, or no readable config.json in it.
+        UserError: the folder does not exist, or has no readable config.json.
     """
     config = _read_config(folder)
     seen_mazes, unseen_mazes = _texts(config.get("mazes")), _texts(config.get("eval_mazes"))
@@ -103,19 +103,19 @@ def read_run(folder: Path) -> Run:
 
 
 def number(value: Any) -> float | None:
-    """A finite number, or nothing."""
+    """The value if it is a finite number, otherwise None."""
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
         return float(value)
     return None
 
 
 def slug(name: str) -> str:
-    """The part of a file name that stands for a maze or method."""
+    """The name of a maze or method as part of a file name."""
     return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds, or None if it is missing or half-written."""
+    """The contents of a JSON file; None if it is missing or damaged."""
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -125,7 +125,7 @@ def read_json(path: Path) -> Any:
 def _read_config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     if not path.is_file():
-        what = "has no config.json, so it is no run folder" if folder.is_dir() else "is no folder"
+        what = "has no config.json, so it is not a run folder" if folder.is_dir() else "is not a folder"
         raise UserError(f"{folder}: {what}; give the folder that `ct-jax train ... --out` wrote")
     config = read_json(path)
     if not isinstance(config, dict):
@@ -138,7 +138,7 @@ def _texts(mapping: Any) -> dict[str, str]:
 
 
 def _walls(texts: dict[str, str]) -> Iterator[tuple[str, np.ndarray]]:
-    """The wall grids of mazes that can be read."""
+    """The wall grids of the mazes, without those that cannot be read."""
     for name, text in texts.items():
         try:
             yield name, parse_walls(text, source="maze")
@@ -173,12 +173,12 @@ def _is_row(row: Any) -> bool:
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an archive, or none if it is missing or half-written."""
+    """The arrays of an archive; empty if it is missing or damaged."""
     try:
-        # opened here, for NumPy leaves the file of a torn archive open
+        # We open the file ourselves, because NumPy does not close a damaged archive.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
-    except Exception:  # a torn archive fails in a dozen ways, all of which mean the same here
+    except Exception:  # a damaged archive raises many kinds of errors
         return {}
     return {name: array for name, array in found.items() if array.dtype.kind in "biuf"}
 
@@ -226,7 +226,7 @@ def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, boo
 
 
 def _by_room(episodes: Episodes, names: list[str]) -> Iterator[Episodes]:
-    """The episodes of each room by themselves."""
+    """The episodes of each room separately."""
     if episodes.room is None:
         return
     for number, name in enumerate(names):
@@ -248,7 +248,7 @@ def _optional(arrays: dict[str, np.ndarray], name: str, n: int) -> np.ndarray | 
 
 
 def _read_curves(path: Path) -> dict[str, dict[str, Curve]]:
-    """Scalars by stage and name; a step run again after a resume counts once. Bad lines are left out."""
+    """Scalars by stage and name. A step that was repeated after a resume counts once. Damaged lines are skipped."""
     points: dict[str, dict[str, dict[float, float]]] = {}
     try:
         lines = path.read_text("utf-8", errors="replace").splitlines()

@@ -1,4 +1,4 @@
-"""Videos of episodes in mazes, by MuJoCo's own renderer without a display, as mp4."""
+"""Videos of episodes in mazes as mp4 files, drawn by MuJoCo's renderer without a display."""
 
 import os
 import warnings
@@ -21,23 +21,23 @@ from ct_jax.progress import Bar
 
 SIZE = 480, 640  # pixels, height and width
 MOST_FPS = 25
-_LAG_S = 0.4  # of the camera: else a robot that sways shakes the maze
-_NEEDS = {  # by the value of MUJOCO_GL, and on Debian and Ubuntu
+_LAG_S = 0.4  # time constant of the camera: it smooths the swaying of the robot
+_NEEDS = {  # remedy by the value of MUJOCO_GL, for Debian and Ubuntu
     "egl": "apt install libegl1 libgl1-mesa-dri",
     "osmesa": "apt install libosmesa6, or set MUJOCO_GL=egl",
     "glfw": "glfw needs a display; without one set MUJOCO_GL=egl",
 }
-_ANY = ("", "enable", "enabled", "on", "true", "1", "glx")  # values of MUJOCO_GL that name no way
+_ANY = ("", "enable", "enabled", "on", "true", "1", "glx")  # values of MUJOCO_GL that do not choose a backend
 _TRAIL_EVERY_M, _TRAIL_MOST = 0.4, 400
 
 
 def check_video(file: Path) -> None:
-    """Raises UserError if no video could be written to the file: told before an evaluation, not after it."""
+    """Raise UserError if a video cannot be written to the file. Call it before a long evaluation."""
     if file.suffix != ".mp4":
         raise UserError(f"--video {file}: give an .mp4 file")
     check_writable(file, option="--video")
     try:
-        import av  # noqa: F401  an optional part
+        import av  # noqa: F401  an optional dependency
     except ImportError:
         raise UserError("--video needs the package av (PyAV): pip install -e '.[video]'") from None
     with _context(8, 8):
@@ -47,12 +47,12 @@ def check_video(file: Path) -> None:
 def write_video(
     file: Path, robot: Robot, maze: Maze, qpos: Float[np.ndarray, "T nq"], goal: Float[np.ndarray, "2"], caption: str
 ) -> None:
-    """Film an episode in real time from above and behind: its path is drawn, and the goal as a disc of its tolerance.
+    """Film an episode in real time from above and behind. The path and the goal, with its tolerance, are drawn.
 
     Args:
         qpos: the robot's generalised coordinates before each control step.
-        goal: its position [m].
-        caption: kept in the file as its title.
+        goal: position of the goal [m].
+        caption: title in the metadata of the file.
     """
     import av
 
@@ -74,14 +74,17 @@ def write_video(
 
 
 def _images(robot: Robot, maze: Maze, qpos: np.ndarray, goal: np.ndarray, *, follow: float) -> Iterator[np.ndarray]:
-    """A picture [height, width, 3] of each pose, of bytes; from one to the next the camera goes that share of the way
-    to the robot."""
+    """A picture of each pose, uint8 [height, width, 3].
+
+    Args:
+        follow: share of the distance to the robot that the camera moves from one picture to the next.
+    """
     model = _scenery(robot, maze)
     data = mujoco.MjData(model)
     height, width = SIZE
     camera, option, scene = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvScene(model, 2000)
     camera.distance, camera.azimuth, camera.elevation = 2.2 * float(maze.cell_m), 90.0, -50.0
-    scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # without a GPU they take twice as long as all else
+    scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # shadows triple the time without a GPU
     rect, image = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
     trail: list[np.ndarray] = []
     looks_at = qpos[0, :2].astype(float)
@@ -109,7 +112,7 @@ def _images(robot: Robot, maze: Maze, qpos: np.ndarray, goal: np.ndarray, *, fol
 
 
 def _scenery(robot: Robot, maze: Maze) -> mujoco.MjModel:
-    """The robot in the whole maze, brightly lit, on a floor of tiles that shows how it moves."""
+    """The robot in the whole maze, with more light, and with tiles on the floor that make the motion visible."""
     spec = static_spec(robot, unpadded(maze), float(maze.cell_m))
     spec.add_texture(
         name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
@@ -117,7 +120,7 @@ def _scenery(robot: Robot, maze: Maze) -> mujoco.MjModel:
     )  # fmt: skip
     tiles = spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True)  # a tile is 2 m wide
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    floor = spec.geom("floor") or spec.worldbody.add_geom(  # the point slides on none
+    floor = spec.geom("floor") or spec.worldbody.add_geom(  # the model of the point has no floor
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 5], contype=0, conaffinity=0
     )
     floor.material, floor.rgba = "tiles", [1, 1, 1, 1]
@@ -128,7 +131,7 @@ def _scenery(robot: Robot, maze: Maze) -> mujoco.MjModel:
 
 
 def _mark(scene: mujoco.MjvScene, at: np.ndarray, radius_m: float, rgba: tuple, shape: mujoco.mjtGeom) -> None:
-    """Add a ball, or a disc, on the floor."""
+    """Add a ball or a disc on the floor."""
     geom = scene.geoms[scene.ngeom]
     size, place = np.array([radius_m, radius_m, 0.02]), np.array([*at, 0.02])
     mujoco.mjv_initGeom(geom, shape, size, place, np.eye(3).ravel(), np.array(rgba, np.float32))
@@ -136,12 +139,12 @@ def _mark(scene: mujoco.MjvScene, at: np.ndarray, radius_m: float, rgba: tuple, 
 
 
 def _backend() -> str:
-    """Which of MuJoCo's ways to OpenGL to take: the one that MUJOCO_GL names, or EGL. Raises UserError."""
+    """The OpenGL backend: that of MUJOCO_GL, or EGL. Raises UserError if MUJOCO_GL names no backend."""
     given = os.environ.get("MUJOCO_GL", "").lower().strip()
     name = "egl" if given in _ANY else given
     if name not in _NEEDS:
         known = ", ".join(_NEEDS)
-        raise UserError(f"MUJOCO_GL='{given}': no way to draw a video; unset it, or give one of: {known}")
+        raise UserError(f"MUJOCO_GL='{given}': cannot draw a video; unset it, or give one of: {known}")
     other = os.environ.get("PYOPENGL_PLATFORM", "")
     if name != "glfw" and other and other.lower() != name:
         raise UserError(f"PYOPENGL_PLATFORM='{other}': a video needs it to be {name} here; unset it")
@@ -150,17 +153,17 @@ def _backend() -> str:
 
 @contextmanager
 def _context(height: int, width: int) -> Iterator[None]:
-    """OpenGL, without a display unless MUJOCO_GL asks for one. Raises UserError where there is none."""
+    """An OpenGL context, without a display unless MUJOCO_GL is glfw. Raises UserError if OpenGL is not available."""
     name = _backend()
     try:
-        with warnings.catch_warnings(action="ignore"):  # GLFW warns of what the error says
-            context = import_module(f"mujoco.{name}").GLContext(width, height)  # fails in many ways
+        with warnings.catch_warnings(action="ignore"):  # GLFW warns, and the error says the same
+            context = import_module(f"mujoco.{name}").GLContext(width, height)  # raises many kinds of errors
             if not context._context:
-                raise RuntimeError("it makes no context")
+                raise RuntimeError("no context was created")
             context.make_current()
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"a video needs OpenGL: {_NEEDS[name]}; here it says: {reason}") from None
+        raise UserError(f"a video needs OpenGL: {_NEEDS[name]} (the error was: {reason})") from None
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""What the numbers of a run mean, in words: labels, the headline, the verdict, and how an episode failed."""
+"""The texts of a report: labels, the headline, the verdict, and how an episode failed."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -12,20 +12,20 @@ from ct_jax.report.reading import Episodes, Place, Run, number
 
 METHOD_LABELS = {"ct": "Control Transformer", "planner": "Planner with the full map", "explorer": "Explorer"}
 METHOD_NOTES = {
-    "ct": "senses only its surroundings and the direction of the goal; no map, no planner",
-    "planner": "knows the whole maze, so it shows what the low-level controller can do at best",
-    "explorer": "remembers what the same local maps showed, and plans through the unknown as if it were free",
+    "ct": "observes only its surroundings and the vector to the goal; it has no map and no planner",
+    "planner": "knows the whole maze; it shows the best result of this low-level controller",
+    "explorer": "builds a map from the same local maps, and plans as if unknown space were free",
 }
 STAGE_LABELS = {
     "prm": "Roadmap", "controller": "Low-level controller", "collect": "Guided trajectories",
     "value": "Value network", "fit": "Control Transformer", "finetune": "Fine-tuning",
     "evaluate": "Evaluation",
 }  # fmt: skip
-KINDS = {  # how a failed episode went, for a single one and as the end of a sentence
+KINDS = {  # kinds of failures: for a single episode, and as the end of a sentence
     "circled": ("went back and forth", "went back and forth over the same few cells until time ran out"),
     "stuck": ("stayed on one spot", "stayed on one spot until time ran out"),
     "late": ("ran out of time on the way", "was still on its way when time ran out"),
-    "early": ("broke off early", "broke off before time was up, by a fall or a fault"),
+    "early": ("ended early", "ended before time ran out, because of a fall or a diverged state"),
 }
 _SEEN = ("in the maze it was trained in", "in the mazes it was trained in")
 _UNSEEN = ("in a maze it had never seen", "in mazes it had never seen")
@@ -38,7 +38,11 @@ def method_label(method: str) -> str:
 
 
 def stage_label(stage: str, *, timing: bool = False) -> str:
-    """The name of a stage for people; "fit-1" is "fit" in round 1 of the fine-tuning. ``timing``: of all it does."""
+    """The name of a stage for people. "fit-1" is "fit" in round 1 of fine-tuning.
+
+    Args:
+        timing: the name is for the time of the stage; the stage "fit" includes the value network.
+    """
     if timing and stage == "fit":
         return "Value and transformer"
     base, _, again = stage.partition("-")
@@ -46,12 +50,12 @@ def stage_label(stage: str, *, timing: bool = False) -> str:
 
 
 def percent(rate: float) -> str:
-    """93 %, never broken over two lines."""
+    """A rate as text, such as 93 %, with a space that does not break."""
     return f"{100 * rate:.0f}{NARROW}%"
 
 
 def decimal(value: float, digits: int = 2) -> str:
-    """A number with a real minus sign and thousands apart."""
+    """A number as text, with a minus sign instead of a hyphen, and with separators of thousands."""
     text = f"{value:,.{digits}f}".replace("-", MINUS)
     return text[1:] if text.startswith(MINUS) and not any(d in text for d in "123456789") else text
 
@@ -65,7 +69,7 @@ def duration(seconds: float) -> str:
 
 
 def count(n: int, one: str) -> str:
-    """3 goals."""
+    """A number with its noun, such as "3 goals"."""
     return f"{n:,} {one}" + ("" if n == 1 else "s")
 
 
@@ -73,13 +77,13 @@ def count(n: int, one: str) -> str:
 
 
 def main_method(run: Run) -> str:
-    """The method a report is about: the transformer, or the first one there is."""
+    """The method that the report is about: the transformer, or the first method."""
     methods = [row["method"] for row in run.rows] or [e.method for e in run.episodes]
     return "ct" if "ct" in methods or not methods else methods[0]
 
 
 def headline(run: Run) -> str:
-    """The title of a report: its most telling number."""
+    """The title of a report: its success rate in unseen mazes, or in seen mazes if there are no others."""
     rows = [row for row in run.rows if row["method"] == main_method(run)]
     for seen, where_to in ((False, "never seen before"), (True, "it was trained in")):
         reached, tried = _tally(row for row in rows if bool(row.get("seen")) == seen)
@@ -88,11 +92,11 @@ def headline(run: Run) -> str:
             one, many = ("rooms", "rooms") if in_rooms(rows) else ("a maze", "mazes")
             where = f"{one if mazes == 1 else many} {where_to}"
             return f"{percent(reached / tried)} of goals reached in {where}"
-    return f"A {run.config.get('robot', 'robot')} on its way: no results yet"
+    return f"{run.config.get('robot', 'robot')}: no results yet"
 
 
 def verdict(run: Run) -> str:
-    """One sentence: what the success rates mean, and how the robot fails if it does."""
+    """One sentence with the success rates and the most common kind of failure."""
     method = main_method(run)
     rows = [row for row in run.rows if row["method"] == method]
     parts = []
@@ -112,12 +116,12 @@ def verdict(run: Run) -> str:
 
 
 def in_rooms(rows: Iterable[dict[str, Any]]) -> bool:
-    """Whether results are of rooms, not of mazes."""
+    """Whether the results are from rooms, not from mazes."""
     return any("worlds" in row for row in rows)
 
 
 def size(place: Place, cell_m: float) -> str:
-    """How large a maze or a room is, and how much stands in it."""
+    """The size of a maze or a room; for a room also the number of obstacles and the share of the floor they cover."""
     if isinstance(place, World):
         obstacles = count(len(place.boxes) + len(place.cylinders), "obstacle")
         return f"{place.side_m:g} x {place.side_m:g} m, {obstacles} on {percent(place.covered())} of the floor"
@@ -126,14 +130,14 @@ def size(place: Place, cell_m: float) -> str:
 
 
 def _tally(rows: Iterable[dict[str, Any]]) -> tuple[int, int]:
-    """Goals reached, and goals tried for."""
+    """The number of goals reached, and the number of episodes."""
     pairs = [(number(row.get("success_rate")), number(row.get("episodes"))) for row in rows]
     known = [(rate, int(n)) for rate, n in pairs if rate is not None and n]
     return sum(round(rate * n) for rate, n in known), sum(n for _, n in known)
 
 
 def _failing(run: Run, rows: list[dict[str, Any]]) -> str:
-    """How the main method fails."""
+    """How the main method fails, as the end of a sentence."""
     reached, tried = _tally(rows)
     if reached == tried:
         return "it did not fail once"
@@ -141,7 +145,7 @@ def _failing(run: Run, rows: list[dict[str, Any]]) -> str:
     kinds = Counter(failure_kind(run, e, int(i)) for e in mine for i in np.flatnonzero(~e.success))
     failures = kinds.total()
     if not failures:
-        return f"{count(tried - reached, 'attempt')} failed, and no paths were kept that would show how"
+        return f"{count(tried - reached, 'attempt')} failed; their paths are not available"
     kind, often = kinds.most_common(1)[0]
     if failures == 1:
         return f"the one time it failed, it {KINDS[kind][1]}"
@@ -152,7 +156,7 @@ def _failing(run: Run, rows: list[dict[str, Any]]) -> str:
 
 
 def failure_kind(run: Run, episodes: Episodes, i: int) -> str:
-    """How episode ``i`` failed, one of ``KINDS``, judged by the second half of its way."""
+    """How episode ``i`` failed: one of ``KINDS``. The second half of its path decides."""
     if episodes.steps[i] < run.horizon:
         return "early"
     way = track(episodes.path, episodes.steps, episodes.start, i)
@@ -165,7 +169,7 @@ def failure_kind(run: Run, episodes: Episodes, i: int) -> str:
 
 
 def failure_text(run: Run, episodes: Episodes, i: int) -> str:
-    """What happened in a failed episode, in half a sentence."""
+    """A short description of a failed episode."""
     kind = KINDS[failure_kind(run, episodes, i)][0]
     after = count(int(episodes.steps[i]), "step")
     return f"{kind}; ended {_missing_m(episodes, i):.1f} m from the goal after {after}"
@@ -177,18 +181,18 @@ def _missing_m(episodes: Episodes, i: int) -> float:
 
 
 def calibration_text(asked: np.ndarray, got: np.ndarray) -> str:
-    """How well the value network predicted the returns."""
+    """A short description of how well the value network predicted the returns."""
     bias = float(np.mean(asked - got))
     spread = float(np.mean(np.abs(asked - got)))
-    kept = f"asked for {decimal(abs(bias), 0)} {'more' if bias > 0 else 'less'} than it got on average"
-    text = f"{kept}; typical error {decimal(spread, 0)}"
+    kept = f"on average, the target was {decimal(abs(bias), 0)} {'higher' if bias > 0 else 'lower'} than the return"
+    text = f"{kept}; mean error {decimal(spread, 0)}"
     if len(got) > 2 and np.ptp(asked) > 0 and np.ptp(got) > 0:
         text += f", correlation {decimal(float(np.corrcoef(asked, got)[0, 1]))}"
     return text
 
 
 def ends(interval: Any) -> tuple[float, float] | None:
-    """The lower and upper end of an interval, or nothing if it is none."""
+    """The lower and upper end of an interval; None if the value is not an interval."""
     if not isinstance(interval, list) or len(interval) != 2:
         return None
     low, high = map(number, interval)
@@ -196,7 +200,7 @@ def ends(interval: Any) -> tuple[float, float] | None:
 
 
 def interval(values: Any, show: Callable[[float], str]) -> str:
-    """An interval as text, or nothing. The unit is said once, and a minus sign never follows a dash."""
+    """An interval as text; empty if the value is not an interval. The unit appears once."""
     if (found := ends(values)) is None:
         return ""
     first, last = map(show, found)
@@ -206,7 +210,7 @@ def interval(values: Any, show: Callable[[float], str]) -> str:
 
 
 def stage_facts(done: dict[str, Any]) -> str:
-    """What a finished stage says of itself, its time aside."""
+    """The facts of a finished stage, without its time."""
     facts = []
     for name, value in done.items():
         scalar = number(value)

@@ -1,6 +1,6 @@
-"""Worlds for Control Transformer: mazes as data, robots, physics engines and ``MazeEnv``. Knows nothing of learning.
+"""Worlds for Control Transformer: mazes as data, robots, physics engines and ``MazeEnv``. No learning code.
 
-A name is imported when it is first used: who only wants to look at a maze does not wait for a physics engine.
+Each name is imported at its first use, so that code that only needs mazes does not load a physics engine.
 """
 
 from importlib import import_module
@@ -36,7 +36,7 @@ _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 def __getattr__(name: str) -> Any:
     if name not in _MODULE:
         raise AttributeError(f"module 'ct_envs' has no attribute '{name}'")
-    if _MODULE[name] == "maze_env":  # which imports MJX
+    if _MODULE[name] == "maze_env":  # it imports MJX
         import_module("ct_envs.quiet")
     return getattr(import_module(f"ct_envs.{_MODULE[name]}"), name)
 

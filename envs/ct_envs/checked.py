@@ -1,6 +1,6 @@
-"""Settings that are checked where they are built, whoever builds them: Python, the command line or a file.
+"""Settings that are checked when they are created: from Python, from the command line, or from a file.
 
-A config is a frozen dataclass that derives from ``Checked``; its annotations say what each setting may be::
+A config is a frozen dataclass that derives from ``Checked``. Its annotations give the type and range of each setting::
 
     @dataclass(frozen=True)
     class ModelConfig(Checked):
@@ -9,7 +9,7 @@ A config is a frozen dataclass that derives from ``Checked``; its annotations sa
         speed_mps: Annotated[float, Above(0, 100)] | None = None
         hidden: Annotated[tuple[Annotated[int, Within(1, 8192)], ...], Within(1, 16)] = (256, 256)  # 1 to 16 entries
 
-What two settings must agree in, a config checks in its own ``__post_init__``, after that of ``super()``.
+A config checks conditions on several settings in its own ``__post_init__``, after that of ``super()``.
 """
 
 import functools
@@ -20,20 +20,20 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from ct_envs.errors import UserError
 
-_SHOWN = 60  # characters of a value that an error shows
+_SHOWN = 60  # maximum number of characters of a value in an error
 _LONGEST_TEXT = 4096
 Config = TypeVar("Config", bound="Checked")
 
 
 @dataclass(frozen=True)
 class Within:
-    """A number from ``low`` to ``high``, or a tuple of so many entries."""
+    """A number from ``low`` to ``high``, or a tuple with that number of entries."""
 
     low: float
     high: float
 
     def holds(self, value: float) -> bool:
-        """Whether the number is one of these; NaN never is."""
+        """Whether the number is in the range; False for NaN."""
         return self.low <= value <= self.high
 
     def __str__(self) -> str:
@@ -45,7 +45,7 @@ class Above(Within):
     """A number above ``low``, at most ``high``."""
 
     def holds(self, value: float) -> bool:
-        """Whether the number is one of these; NaN never is."""
+        """Whether the number is in the range; False for NaN."""
         return self.low < value <= self.high
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ Count = Annotated[int, Within(1, 10**9)]
 
 
 class Checked:
-    """A config whose settings are checked when it is made, by ``dataclasses.replace``, too. Raises UserError."""
+    """A config whose settings are checked when it is created, also by ``dataclasses.replace``. Raises UserError."""
 
     def __post_init__(self) -> None:
         for name, hint in _hints(type(self)).items():
@@ -68,20 +68,20 @@ class Checked:
 
 
 def from_json(kind: type[Config], values: Any, where: str) -> Config:
-    """The config that ``dataclasses.asdict`` and JSON made ``values`` of; a setting that is missing has its default.
+    """A config from JSON values, as written from ``dataclasses.asdict``. Missing settings have their defaults.
 
     Args:
-        where: what the errors call it, such as "settings".
+        where: name of the config in errors, such as "settings".
 
     Raises:
-        UserError: a setting out of its range, one that is unknown, or a missing config, which is named.
+        UserError: a setting is unknown or out of its range, or a config in this config is missing.
     """
     if not isinstance(values, dict):
         raise UserError(f"{where} is {shown(values)}; give an object with the settings of a {kind.__name__}")
     hints, built = _hints(kind), {}
     for name in values:
         if name not in hints:
-            raise UserError(f"{where} of another version: this one knows no '{shown(name, quoted=False)}'")
+            raise UserError(f"{where} of another version: '{shown(name, quoted=False)}' is unknown")
     for name, hint in hints.items():
         if name in values:
             built[name] = _read(hint, values[name], f"{where}.{name}")
@@ -94,7 +94,7 @@ def from_json(kind: type[Config], values: Any, where: str) -> Config:
 
 
 def _read(hint: Any, value: Any, where: str) -> Any:
-    """A setting as its config wants it: a tuple for a list, a config for an object."""
+    """A setting from its JSON value: a list becomes a tuple, and an object becomes a config."""
     config = next((part for part in (hint, *get_args(hint)) if _is_config(part)), None)
     if config is not None and not (value is None and _takes_none(hint)):
         return from_json(config, value, where)
@@ -121,7 +121,7 @@ def _takes_none(hint: Any) -> bool:
 
 
 def _wanted(hint: Any, value: Any) -> str:
-    """What a value should be instead; empty if it is that."""
+    """A description of the allowed values; empty if the value is allowed."""
     bounds = None
     if get_origin(hint) is Annotated:
         hint, *notes = get_args(hint)
@@ -135,7 +135,7 @@ def _wanted(hint: Any, value: Any) -> str:
     if get_origin(hint) is tuple:
         return _wanted_tuple(get_args(hint), bounds, value)
     if hint in (int, float):
-        # True and False are no numbers here.
+        # True and False do not count as numbers.
         right = isinstance(value, int if hint is int else (int, float)) and not isinstance(value, bool)
         name = "a whole number" if hint is int else "a number"
         holds = right and (bounds or _FINITE).holds(value)
@@ -148,14 +148,15 @@ def _wanted(hint: Any, value: Any) -> str:
 
 
 def _wanted_tuple(kinds: tuple[Any, ...], bounds: Within | None, value: Any) -> str:
-    """``_wanted`` of a tuple with entries of these kinds; the last may be an ellipsis."""
+    """``_wanted`` for a tuple with entries of these kinds. The last kind may be an ellipsis."""
     alike = kinds[-1] is Ellipsis
     size = bounds or Within(0, 1000) if alike else Within(len(kinds), len(kinds))
     of = [kinds[0]] * len(value) if isinstance(value, tuple) and alike and size.holds(len(value)) else kinds
     if isinstance(value, tuple) and size.holds(len(value)):
         wrong = next((wanted for kind, entry in zip(of, value, strict=True) if (wanted := _wanted(kind, entry))), "")
         return f"for each entry {wrong}" if wrong else ""
-    return f"a tuple of {_plain(size.low)} entries" if size.low == size.high else f"a tuple of entries, {size} of them"
+    low, high = _plain(size.low), _plain(size.high)
+    return f"a tuple of {low} entries" if low == high else f"a tuple of {low} to {high} entries"
 
 
 def _plain(number: float) -> str:
@@ -163,9 +164,9 @@ def _plain(number: float) -> str:
 
 
 def shown(value: Any, *, quoted: bool = True) -> str:
-    """A value as an error may show it: short, on one line, whatever it is."""
+    """Any value as a short text of one line, for errors."""
     try:
         text = repr(value) if quoted or not isinstance(value, str) else repr(value)[1:-1]
-    except (ValueError, RecursionError):  # an integer of thousands of digits, or a list in a list in a list ...
-        return f"a {type(value).__name__} too large to be shown"
+    except (ValueError, RecursionError):  # an integer with thousands of digits, or a deeply nested list
+        return f"too large to be shown ({type(value).__name__})"
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 4]} ..."

@@ -1,9 +1,8 @@
-"""The one exception a user is meant to read."""
+"""The exception for bad input."""
 
 
 class UserError(ValueError):
-    """Bad input. Its text is a single line that names the thing, the place and the mend.
+    """Bad input. Its text is one line with the wrong value, its place (file, option or argument), and the remedy.
 
-    The command line prints it as ``error: ...`` and exits with status 2; a library user can catch it as a
-    ``ValueError``.
+    The command line prints it as ``error: ...`` and exits with status 2. Programs can catch it as a ``ValueError``.
     """

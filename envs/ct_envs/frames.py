@@ -1,8 +1,8 @@
 """A robot's own frame, and the symmetries of its body.
 
-A world may be rotated and reflected by the symmetries of the square: this only permutes the cells of its local maps. It
-transforms a robot's proprioception and action by matrices, most of them signed permutations. A body with symmetries of
-its own has more of them, which leave the world unchanged.
+The symmetries of the square rotate and reflect the world. They permute the cells of its local maps, and they transform
+proprioception and actions by matrices (mostly signed permutations). If the robot's body is symmetric, there are
+additional symmetries that do not change the world.
 """
 
 import functools
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ct_envs.errors import UserError
 from ct_envs.robots import Robot
 
-FrameName = Literal["world", "heading"]  # frame of vectors: the world's, or the robot's own
+FrameName = Literal["world", "heading"]  # frame of vectors: the world's, or the robot's own frame
 
 
 class Symmetries(NamedTuple):
@@ -54,7 +54,7 @@ def symmetries(robot: Robot) -> Symmetries:
 
 
 def turns(found: Symmetries) -> Symmetries:
-    """The symmetries that rotate the world with the robot in it and do not change its joints."""
+    """The symmetries that rotate the world and the robot together, without changes of its joints."""
     plain = (np.linalg.det(found.world) > 0) & np.isclose(found.action, np.eye(found.action.shape[-1])).all((1, 2))
     return Symmetries(*(matrices[plain] for matrices in found))
 
@@ -64,7 +64,7 @@ def _point() -> list[tuple[np.ndarray, ...]]:
 
 
 def _ant() -> list[tuple[np.ndarray, ...]]:
-    """Two reflections of world and body together, and a quarter turn of the body in an unchanged world."""
+    """Two reflections of the world and the body, and a quarter turn of the body in an unchanged world."""
     # New leg i is old leg source[i]; its hip and ankle have these signs. See assets/ant.xml for the axes of the joints.
     flip_x = _ant_element(_FLIP_X, -1, [1, 0, 3, 2], -1, [-1, -1, -1, -1], quat=np.diag([1.0, 1.0, -1.0, -1.0]))
     swap = _ant_element(_SWAP, -1, [0, 3, 2, 1], -1, [1, -1, 1, -1], quat=_signed([0, 2, 1, 3], [1, -1, -1, -1]))
@@ -85,12 +85,12 @@ def _ant_element(
 
 
 def _element(world: np.ndarray, quat: np.ndarray, angular: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, ...]:
-    """For a free torso: velocity is a vector in the world, angular velocity an axial vector in the body."""
+    """A symmetry of a robot with a free torso: velocity is a world vector, angular velocity an axial body vector."""
     return world, _blocks(np.eye(1), quat, joints, _blocks(world, np.eye(1)), angular, joints), joints
 
 
 def _humanoid() -> list[tuple[np.ndarray, ...]]:
-    """A reflection that swaps left and right, and a quarter turn of the world with the robot in it."""
+    """A reflection that swaps left and right, and a quarter turn of the world and the robot together."""
     # New joint i is old joint order[i] with this sign: abdomen z, y, x; right leg x, z, y, knee; left leg; right arm
     # (two shoulder joints, elbow); left arm. See assets/humanoid.xml for the axes.
     order = [0, 1, 2, 7, 8, 9, 10, 3, 4, 5, 6, 14, 15, 16, 11, 12, 13]
@@ -124,10 +124,10 @@ _GENERATORS = {"point": _point, "ant": _ant, "humanoid": _humanoid, "turtlebot3"
 
 
 def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b P-1"]]:
-    """The heading (a unit vector in the plane) of a robot with a free torso, and its proprioception relative to that.
+    """The heading of a robot with a free torso (a unit vector in the plane), and its proprioception relative to it.
 
-    The second is height, the world's up in the torso's frame, joint angles, velocity with x along the heading, angular
-    velocity and joint velocities. It does not change when the world is rotated.
+    The relative proprioception is height, the up vector in the torso's frame, joint angles, velocity with x along the
+    heading, angular velocity and joint velocities. It does not change when the world is rotated.
     """
     joints = (proprio.shape[-1] - 11) // 2
     height, quat, angles, velocity, rest = jnp.split(proprio, np.cumsum([1, 4, joints, 3]).tolist(), -1)
@@ -140,7 +140,7 @@ def own_frame(proprio: Float[Array, "*b P"]) -> tuple[Float[Array, "*b 2"], Floa
 
 
 def turn(heading: Float[Array, "*b 2"], vector: Float[Array, "*b 2"]) -> jax.Array:
-    """A vector in the world, as components along and across the heading."""
+    """The components along and across the heading of a vector in the world frame."""
     cosine, sine = heading[..., 0], heading[..., 1]
     along = cosine * vector[..., 0] + sine * vector[..., 1]
     return jnp.stack([along, cosine * vector[..., 1] - sine * vector[..., 0]], -1)

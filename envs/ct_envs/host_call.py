@@ -1,9 +1,9 @@
 """Python functions that compiled programs call on the CPU by name. Such programs can be cached for other processes.
 
-JAX does not cache programs with a ``pure_callback`` on disk, and nearly every program here steps MuJoCo. XLA's foreign
-function interface finds a function by its name and passes its own buffers: a call takes a quarter of the time.
+JAX cannot cache programs with a ``pure_callback`` on disk, and nearly all of our programs step MuJoCo. XLA's foreign
+function interface finds a function by its name, and passes its own buffers. A call takes a quarter of the time.
 
-The structures are those of ``xla/ffi/api/c_api.h`` (``jax.ffi.include_dir()``), up to the last field that is used.
+The structures are those of ``xla/ffi/api/c_api.h`` (``jax.ffi.include_dir()``), up to the last field that we use.
 """
 
 import ctypes

@@ -34,7 +34,7 @@ def lidar_map(
             ``range_m`` or more are not drawn.
         goal: vector from the robot to the goal [*b, 2] (m), in the frame of the map.
         yaw_rad: yaw of the robot in the frame of the map [*b]; 0 for a map in the robot's own frame (x ahead, y left).
-        missing_ok: accept NaN, infinity and 0, by which lidars report that a beam did not come back.
+        missing_ok: accept NaN, infinity and 0. Lidars report them for beams that did not come back.
 
     Raises:
         UserError: the number of ranges is wrong, a range is negative or, without ``missing_ok``, a range is missing.

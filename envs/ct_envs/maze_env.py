@@ -1,9 +1,9 @@
 """``MazeEnv``: a robot in a maze as a ``brax.envs.Env``, pure in ``reset`` and ``step``.
 
-The maze and the tasks (starts and goals) are data that travel in ``state.info``, so each environment under ``vmap`` can
-have its own and a new maze compiles nothing. What changes within an episode lies in ``state.pipeline_state``, its goal
-and its clock included: brax's training wrappers begin an episode anew by putting back its first ``pipeline_state`` and
-``obs``, and nothing else.
+The maze and the tasks (starts and goals) are data in ``state.info``. Therefore each environment under ``vmap`` can have
+its own maze, and a new maze does not need a new compilation. Everything that changes during an episode is in
+``state.pipeline_state``, including the goal and the number of steps. brax's training wrappers rely on this: they
+restart an episode by restoring its first ``pipeline_state`` and ``obs``.
 """
 
 import copy
@@ -25,20 +25,22 @@ from ct_envs.robots import Robot, get_robot
 
 @struct.dataclass
 class Tasks:
-    """Starts and goals that resets draw from, in place of free points of the maze."""
+    """Starts and goals for resets. Without tasks, resets draw free points of the maze."""
 
     start: Float[Array, "*b M 2"]  # [m]
     goal: Float[Array, "*b M 2"]  # [m]
-    n: Int[Array, "*b"]  # how many of the M are meant
-    follow: Int[Array, "*b M D"] | None = None  # tasks one of which follows a success, from where the robot is then
-    turn_rad: Float[Array, "*b"] | None = None  # a robot with a heading begins within this of facing its goal
+    n: Int[Array, "*b"]  # number of valid tasks; the others are padding
+    # After a success, the goal of one of these D tasks comes next, from the robot's current position.
+    follow: Int[Array, "*b M D"] | None = None
+    # Maximum angle between the initial heading and the direction of the goal, for a robot with a heading.
+    turn_rad: Float[Array, "*b"] | None = None
 
 
 def check_tasks(tasks: Tasks, maze: Maze) -> None:
-    """Raise UserError unless the tasks of one environment, without leading axes, can be tasks in that maze.
+    """Raise UserError if the tasks of one environment (without leading axes) are not valid in the maze.
 
-    Shapes are looked at always. Values are looked at unless they are traced: every task that can be drawn begins and
-    ends at finite points of free cells, and ``n`` and ``follow`` point at tasks that are there.
+    Shapes are always checked. Values are checked unless they are traced: starts and goals must be finite points in free
+    cells, and ``n`` and ``follow`` must refer to existing tasks.
     """
     m = jnp.shape(tasks.start)[0] if jnp.ndim(tasks.start) else 0
     shapes = {"start": (m, 2), "goal": (m, 2), "n": ()}
@@ -60,13 +62,13 @@ def _is_traced(tree: Any) -> bool:
 
 
 def _check_values(tasks: Tasks, maze: Maze, m: int) -> None:
-    """The part of ``check_tasks`` that looks at values."""
+    """Check the values for ``check_tasks``."""
     n, follow = int(tasks.n), np.asarray([] if tasks.follow is None else tasks.follow, int)
     if not 1 <= n <= m:
-        raise UserError(f"tasks.n is {n}; give a number from 1 to {m}, the tasks that there are")
+        raise UserError(f"tasks.n is {n}; give a number from 1 to {m}, the number of tasks")
     if ((follow < 0) | (follow >= m)).any():
         wrong = follow[(follow < 0) | (follow >= m)][0]
-        raise UserError(f"tasks.follow has an entry {wrong}; give numbers of tasks, from 0 to {m - 1}")
+        raise UserError(f"tasks.follow has an entry {wrong}; give indices of tasks, from 0 to {m - 1}")
     if tasks.turn_rad is not None and not np.isfinite(tasks.turn_rad):
         raise UserError(f"tasks.turn_rad is {tasks.turn_rad}; give a finite angle [rad]")
     drawn = np.union1d(np.arange(n), follow).astype(int)
@@ -82,23 +84,23 @@ def _check_values(tasks: Tasks, maze: Maze, m: int) -> None:
             which = int(np.argmin(free))
             x, y = points[which]
             where = f"tasks.{name}[{drawn[which]}] is ({x:g}, {y:g}) m"
-            raise UserError(f"{where}, in a wall or outside the maze; give points of free cells")
+            raise UserError(f"{where}, in a wall or outside the maze; give points in free cells")
 
 
 @struct.dataclass
 class EpisodeState(PhysicsState):
-    """``pipeline_state``: the physics, and what else is of one episode."""
+    """``pipeline_state``: the physics, and the other variables of an episode."""
 
     goal: Float[Array, "*b 2"]  # [m]
-    task: Int[Array, "*b"]  # its number among the tasks
+    task: Int[Array, "*b"]  # index of the task
     episode_steps: Int[Array, "*b"]  # control steps so far
 
 
 class MazeState(State):
-    """brax's ``State``, whose ``info`` tells of the ``pipeline_state`` that it has.
+    """brax's ``State``, with ``info`` entries that follow its ``pipeline_state``.
 
-    Whoever puts in another ``pipeline_state``, as brax's wrappers do to begin an episode anew, gets its ``position``,
-    ``goal``, ``task`` and ``episode_steps`` in ``info``.
+    Replacing ``pipeline_state``, as brax's wrappers do to restart an episode, also replaces ``position``, ``goal``,
+    ``task`` and ``episode_steps`` in ``info``.
     """
 
     def replace(self, **updates: Any) -> "MazeState":
@@ -119,19 +121,19 @@ def broke_off(info: dict[str, Any]) -> Float[Array, "*b"]:
 
 
 class MazeEnv(Env):
-    """Reach the goal. Reward is minus the distance to it after the step [m] (paper, sec. III-G).
+    """Reach the goal. The reward is minus the distance to the goal after the step [m] (paper, sec. III-G).
 
-    Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point just its
-    velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of bytes.
-    Action: [-1, 1]^nu, shares of the actuators' range; what lies beyond is clipped. An episode ends with success
-    (within the goal tolerance), with a failure (a fall, or a state or action that is not finite, which leaves the robot
-    where it was) or, as truncation, at the horizon. ``state.info`` holds ``success``, ``fall``, ``diverged`` (something
-    was not finite), ``collision`` (some part touches a wall now), ``truncation``, ``episode_steps``, ``position``,
-    ``goal``, ``task``, ``maze``, ``tasks`` and ``key``.
+    Observation: a dict of ``proprio`` [P] (``qpos`` without the planar position, then ``qvel``; for the point only its
+    velocity, m/s), ``goal`` [2] (from the robot to the goal, m) and, with ``maps``, ``map`` [2, 25, 25] of uint8.
+    Action: [-1, 1]^nu, shares of the actuators' range; larger values are clipped. An episode ends with a success
+    (within the goal tolerance), with a failure, or at the horizon (truncation). A failure is a fall, or a state or
+    action that is not finite; in the latter case the robot keeps its previous state. ``state.info`` holds ``success``,
+    ``fall``, ``diverged`` (something was not finite), ``collision`` (a part of the robot touches a wall now),
+    ``truncation``, ``episode_steps``, ``position``, ``goal``, ``task``, ``maze``, ``tasks`` and ``key``.
 
-    brax's training wrappers end an episode at their own ``episode_length`` and begin it anew from its first state: give
-    them an environment with a longer horizon, for they take the end at its own for a failure. Networks that want one
-    array for an observation: ``FlatObservation``.
+    brax's training wrappers end an episode at their own ``episode_length``, and restart it from its first state. Give
+    them an environment with a longer horizon, because they treat the end at the environment's horizon as a failure.
+    For networks that take one array as observation, use ``FlatObservation``.
     """
 
     def __init__(
@@ -151,17 +153,17 @@ class MazeEnv(Env):
         Args:
             robot: a ``Robot`` or its name.
             engine: "mjx", "mujoco", or "auto" (by platform).
-            maze: the maze of ``reset`` when it is given none.
+            maze: the default maze of ``reset``.
             map_cell_m: side of a cell of the local map [m].
-            maps: whether observations hold the local map.
-            auto_reset: whether a finished environment starts anew, with a fresh start and goal; if not, it stays as
-                it is and ``done`` stays 1.
-            horizon: control steps of an episode; by default the robot's.
-            reset_velocity_mps: spread of the speed after a reset; by default the robot's.
+            maps: include the local map in observations.
+            auto_reset: restart a finished environment with a new start and goal. Otherwise its state does not change
+                any more, and ``done`` stays 1.
+            horizon: control steps of an episode; the default is the robot's horizon.
+            reset_velocity_mps: standard deviation of the speed after a reset; the default is the robot's.
             cell_m: side of the maze's cells [m].
 
         Raises:
-            UserError: unknown robot or engine, cells too small for the robot, or a maze with cells of another size.
+            UserError: unknown robot or engine, cells too small for the robot, or a maze with a different cell size.
         """
         if maze is not None:
             _check_maze(maze, cell_m)
@@ -188,7 +190,7 @@ class MazeEnv(Env):
 
     @property
     def proprio_size(self) -> int:
-        """Numbers of proprioception: everything but the position in the plane."""
+        """Size of the proprioception: ``qpos`` and ``qvel`` without the position in the plane."""
         model = self.engine.model
         return model.nq - 2 + model.nv
 
@@ -201,15 +203,15 @@ class MazeEnv(Env):
         return self.engine.name
 
     def reset(self, rng: jax.Array, maze: Maze | None = None, tasks: Tasks | None = None) -> MazeState:
-        """A fresh episode in ``maze``, from a random free point to another of the same region, or from ``tasks``.
+        """A new episode. Start and goal come from ``tasks``, or are random free points of the same region.
 
-        Values of ``maze`` and ``tasks`` that are traced, by ``jit`` or ``vmap``, cannot be checked; their shapes are.
-        Then walls stand in other places than on the map if its cells have another size, a robot begins where it is
-        told to, be it in a wall, and a goal in a wall or of NaN is never reached. A task's number beyond the last means
-        the last, and ``n`` below 1 the first. Call ``check_tasks`` first where they may be wrong.
+        Under ``jit`` or ``vmap``, only the shapes of ``maze`` and ``tasks`` are checked, because their values are
+        traced. Call ``check_tasks`` first if the values may be wrong. With wrong values: walls are not where the map
+        shows them if the cell size differs; a robot may start in a wall; a goal that is NaN or in a wall is never
+        reached; an index of a task beyond the last means the last task; ``n`` below 1 means the first task.
 
         Raises:
-            UserError: no maze; maze or tasks of wrong shapes or values, see ``check_tasks``.
+            UserError: no maze, or a maze or tasks with wrong shapes or values, see ``check_tasks``.
         """
         maze = self.maze if maze is None else maze
         if maze is None:
@@ -224,7 +226,7 @@ class MazeEnv(Env):
         return self._observe(self._begin(now, maze, tasks), MazeState(None, {}, zero, zero, {}, info))
 
     def _begin(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> EpisodeState:
-        """The beginning of an episode."""
+        """The first state of a new episode."""
         task_key, physics_key = jax.random.split(key)
         task, start, goal = self._draw_task(task_key, maze, tasks)
         physics = self._initial_physics(physics_key, start, goal, tasks)
@@ -232,7 +234,7 @@ class MazeEnv(Env):
         return EpisodeState(physics.qpos, physics.qvel, physics.qacc_warmstart, goal, task, steps)
 
     def _draw_task(self, key: jax.Array, maze: Maze, tasks: Tasks | None) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Number, start and goal of a task."""
+        """Index, start and goal of a random task."""
         if tasks is not None:
             i = jax.random.randint(key, (), 0, tasks.n, jnp.int32)
             start, goal = (jnp.asarray(points, jnp.float32) for points in (tasks.start, tasks.goal))
@@ -242,8 +244,11 @@ class MazeEnv(Env):
     def _go_on(
         self, key: jax.Array, tasks: Tasks | None, finished: EpisodeState, won: jax.Array, fresh: EpisodeState
     ) -> EpisodeState:
-        """What follows a finished episode: a fresh one, or after a success, where tasks follow each other, the robot
-        as it is, with the next goal."""
+        """The state after a finished episode.
+
+        After a success with ``tasks.follow``, the robot keeps its state and gets the next goal. Otherwise it is a new
+        episode.
+        """
         if tasks is None or tasks.follow is None:
             return fresh
         follow = jnp.asarray(tasks.follow, jnp.int32)
@@ -255,7 +260,7 @@ class MazeEnv(Env):
         return fresh.replace(**robot, task=task, goal=goal)
 
     def _initial_physics(self, key: jax.Array, start: jax.Array, goal: jax.Array, tasks: Tasks | None) -> PhysicsState:
-        """Standing at ``start`` [m]; a robot that has a heading looks anywhere, or not too far from its goal."""
+        """The robot in its standing pose at ``start`` [m], with a random heading (see ``Tasks.turn_rad``)."""
         model, robot = self.engine.model, self.robot
         speed_key, yaw_key, joint_key = jax.random.split(key, 3)
         qpos = jnp.asarray(model.key_qpos[0] if model.nkey else model.qpos0, jnp.float32).at[:2].set(start)
@@ -274,7 +279,7 @@ class MazeEnv(Env):
         return PhysicsState(qpos, qvel, still)
 
     def _fell(self, physics: PhysicsState) -> jax.Array:
-        """Whether the torso is tilted too far or too low."""
+        """Whether the torso is tilted too much or is too low."""
         fell = jnp.zeros((), bool)
         if self.robot.upright_min is not None:
             _, x, y, _ = physics.qpos[3:7]
@@ -291,11 +296,11 @@ class MazeEnv(Env):
         return state.replace(pipeline_state=episode, obs=obs)
 
     def step(self, state: MazeState, action: jax.Array) -> MazeState:
-        """One control step. With ``auto_reset`` a finished state comes back as the first of the next episode, with the
-        reward, ``done`` and outcome of the finished one.
+        """One control step. With ``auto_reset``, the last step of an episode returns the first state of the next
+        episode, with the reward, ``done`` and outcome of the finished one.
 
         Raises:
-            UserError: an action of another shape than [nu].
+            UserError: the shape of the action is not [nu].
         """
         if jnp.shape(action) != (self.action_size,):
             raise UserError(
@@ -305,7 +310,7 @@ class MazeEnv(Env):
         action = jnp.asarray(action, jnp.float32)
         before: Any = state.pipeline_state
         walls = nearest_walls(state.info["maze"], before.qpos[:2])
-        # MuJoCo would read an action that is not a number as zero, and carry on.
+        # MuJoCo would treat NaN in an action as zero, and continue.
         usable = jnp.all(jnp.isfinite(action))
         ctrl = jnp.where(usable, jnp.clip(action, -1.0, 1.0), 0.0)
         physics, touching = self.engine.step(before, self._ctrl_max * ctrl, walls)
@@ -339,7 +344,7 @@ class MazeEnv(Env):
 
 
 def _check_maze(maze: Maze, cell_m: float) -> None:
-    """Raise UserError unless it is one maze, with cells of that size as far as that is known yet."""
+    """Raise UserError unless this is a single maze with cells of this size. A traced cell size is not checked."""
     if jnp.ndim(maze.walls) != 2:
         raise UserError(
             f"the maze's walls have shape {jnp.shape(maze.walls)}; reset many mazes under jax.vmap(env.reset)"
@@ -349,9 +354,9 @@ def _check_maze(maze: Maze, cell_m: float) -> None:
 
 
 class FlatObservation(Wrapper):
-    """A ``MazeEnv`` whose observation is one array: proprioception, the vector to the goal and, with ``maps``, the map.
+    """A ``MazeEnv`` with one array as observation: proprioception, the vector to the goal and, with ``maps``, the map.
 
-    For learners such as brax's PPO: ``ppo.train(environment=FlatObservation(MazeEnv(maze=...)), ...)``.
+    It is for learners such as brax's PPO: ``ppo.train(environment=FlatObservation(MazeEnv(maze=...)), ...)``.
     """
 
     env: MazeEnv

@@ -1,7 +1,7 @@
-"""Memory that C code fills with zeros and may never use, given back to the system until it does.
+"""Return memory pages to the system that C code has filled with zeros but may never use.
 
-A PyBullet client clears two buffers of 8 MB, for what nobody here asks it. A page that was given back reads as zeros,
-so nothing changes but the memory that the process takes.
+A PyBullet client clears two buffers of 8 MB that we do not use. A returned page still reads as zeros, so only the
+memory usage of the process changes.
 """
 
 import ctypes
@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 
 _MAPS = Path("/proc/self/maps")
-_ANONYMOUS = re.compile(r"([0-9a-f]+)-([0-9a-f]+) rw.p \S+ \S+ 0 *$", re.MULTILINE)  # private, of no file, no stack
-_FEWEST = 1024  # pages in a row: Python's own objects, which come and go meanwhile, have never so many to themselves
+_ANONYMOUS = re.compile(r"([0-9a-f]+)-([0-9a-f]+) rw.p \S+ \S+ 0 *$", re.MULTILINE)  # private, without file or stack
+_FEWEST = 1024  # minimum number of consecutive pages; Python's own objects never have this many
 
 Range = tuple[int, int]  # of addresses
 
 
 @contextmanager
 def zeros_given_back() -> Iterator[None]:
-    """Gives back, at the end, the pages of zeros that were allocated within; elsewhere than on Linux, none.
+    """A context that returns zero pages to the system at its end, if they were allocated inside it. Linux only.
 
-    No other thread may work meanwhile: what it writes while its page is given back would be lost.
+    No other thread may run at that time: its writes to a page that is being returned would be lost.
     """
     before = list(_anonymous())
     yield
@@ -45,7 +45,7 @@ def _anonymous() -> Iterator[Range]:
 
 
 def _without(ranges: list[Range], others: list[Range]) -> Iterator[Range]:
-    """What is in ranges and not in others; both are in order."""
+    """The parts of ``ranges`` that are not in ``others``. Both are sorted."""
     for start, end in ranges:
         for low, high in others:
             if low < end and high > start:

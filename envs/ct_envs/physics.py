@@ -1,9 +1,9 @@
-"""One physics contract, two engines: "mjx" (compiled by XLA) and "mujoco" (C threads behind a callback).
+"""Two physics engines with the same interface: "mjx" (compiled by XLA) and "mujoco" (C threads behind a callback).
 
-The model holds the robot and ``WALLS`` boxes. Before each control step the boxes are put on the wall cells that the
-robot could touch during it, so one compiled program serves every maze and the number of contacts stays small. A robot
-that reaches less than half a cell in a step overlaps at most a 2 x 2 block of cells, its own (free) one among them:
-three boxes miss nothing.
+The model contains the robot and ``WALLS`` boxes. Before each control step, the boxes are moved to the wall cells that
+the robot can touch in this step. Therefore one compiled program serves all mazes, and the number of contacts is small.
+Three boxes are enough: a robot that reaches less than half a cell in a step overlaps at most a 2 x 2 block of cells,
+and its own cell is free.
 """
 
 import functools
@@ -28,13 +28,13 @@ from ct_envs.robots import Robot, model_xml
 
 WALLS = 3
 WALL_HEIGHT_M = 2.0
-_PARKED_M = -1000.0  # height of a box that stands for no wall
+_PARKED_M = -1000.0  # height of an unused box
 ENGINES = ("auto", "mjx", "mujoco")
 
 
 @struct.dataclass
 class PhysicsState:
-    """Everything a step needs of the past."""
+    """The state that a step depends on."""
 
     qpos: Float[Array, "*b nq"]
     qvel: Float[Array, "*b nv"]
@@ -42,7 +42,7 @@ class PhysicsState:
 
 
 class Engine(Protocol):
-    """Steps one robot, or under ``vmap`` many. Pure: the same inputs give the same state."""
+    """Steps one robot, or many under ``vmap``. A pure function: the same inputs give the same state."""
 
     name: str
     model: mujoco.MjModel
@@ -61,7 +61,7 @@ def build_model(robot: Robot, *, cell_m: float = CELL_M) -> mujoco.MjModel:
     """The robot's model with ``WALLS`` movable wall boxes of one cell.
 
     Raises:
-        UserError: cells so small that three boxes could miss a wall.
+        UserError: the cells are so small that three boxes are not enough.
     """
     reach = robot.touch_m + robot.top_speed_mps * robot.control_dt_s
     if reach > cell_m / 2:
@@ -94,7 +94,7 @@ def add_wall(body: mujoco.MjsBody, cell_m: float, *, name: str = "") -> None:
 
 
 def nearest_walls(maze: Maze, position: Float[Array, "2"]) -> Float[Array, "WALLS 3"]:
-    """Centres [m] of the wall cells a robot at ``position`` could touch in a step; boxes not needed are parked."""
+    """Centres [m] of the wall cells that a robot at ``position`` can touch in a step. Unused boxes are far below."""
     cell = cell_of(maze, position)
     inside = position[::-1] / maze.cell_m - cell
     row, column = jnp.where(inside >= 0.5, 1, -1)
@@ -106,7 +106,7 @@ def nearest_walls(maze: Maze, position: Float[Array, "2"]) -> Float[Array, "WALL
 
 
 def check_engine(name: str) -> None:
-    """Raise UserError, with the valid names, if there is no such engine."""
+    """Raise UserError with the valid names if the engine is unknown."""
     if name not in ENGINES:
         raise UserError(f"no engine named '{name}'; engines: {', '.join(ENGINES)}")
 
@@ -132,7 +132,7 @@ class MjxEngine:
             self._mjx_model = mjx.put_model(model)
 
     def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
-        with jax.enable_x64(False):  # with 64 bits, MJX mixes them with 32
+        with jax.enable_x64(False):  # with 64 bits enabled, MJX mixes 32 and 64 bits
             data = mjx.make_data(self._mjx_model).replace(
                 qpos=state.qpos,
                 qvel=state.qvel,
@@ -146,7 +146,7 @@ class MjxEngine:
 
 
 class MujocoEngine:
-    """Physics in MuJoCo's own C threads: on CPU about forty times the speed of MJX."""
+    """Physics in MuJoCo's C threads. On a CPU it is about forty times as fast as MJX."""
 
     name = "mujoco"
 
@@ -158,7 +158,7 @@ class MujocoEngine:
         host_call.register(self._name, lambda inputs, after: np.copyto(after, self._step(inputs)))
 
     def step(self, state: PhysicsState, ctrl: jax.Array, walls: jax.Array) -> tuple[PhysicsState, jax.Array]:
-        # One array each way: every further one costs a call as much as the physics of some robots.
+        # Use one array in each direction: each further array costs as much time as the physics of several robots.
         inputs = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl, walls.ravel()])
         nq, nv = self.model.nq, self.model.nv
         shape = jax.ShapeDtypeStruct((nq + 2 * nv + WALLS,), inputs.dtype)
@@ -172,7 +172,7 @@ class MujocoEngine:
         return PhysicsState(qpos, qvel, warmstart), jnp.any(found > 0).astype(jnp.float32)
 
     def _step(self, inputs: np.ndarray) -> np.ndarray:
-        """Whole states in, whole states out; NumPy only, since JAX must not be called from a callback."""
+        """Step a batch of states [*b, n]. NumPy only, because JAX must not be called in a callback."""
         inputs = np.asarray(inputs)
         rows = inputs.reshape(-1, inputs.shape[-1])
         with self._lock:
@@ -186,7 +186,7 @@ class MujocoEngine:
         return after.reshape(*inputs.shape[:-1], -1)
 
     def _batch(self, n: int) -> tuple[Batch, list[np.ndarray], np.ndarray]:
-        """n simulations, and as live arrays [n, ...] of two axes what goes in and the contacts found at the walls."""
+        """n simulations, with views [n, ...] of their inputs and of the contacts at the walls."""
         if n not in self._batches:
             threads = min(n, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
             batch = Batch(self.model, nsim=n, nthread=threads)
@@ -200,7 +200,7 @@ class MujocoEngine:
 
 
 def _digest(model: mujoco.MjModel, n_substeps: int) -> str:
-    """What tells an engine from others, in any process."""
+    """A digest of an engine, the same in all processes."""
     image = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, image)
     return hashlib.sha256(image.tobytes() + bytes([n_substeps])).hexdigest()[:16]
@@ -208,12 +208,12 @@ def _digest(model: mujoco.MjModel, n_substeps: int) -> str:
 
 @functools.cache
 def static_model(robot: Robot, walls: bytes, height: int, width: int, cell_m: float = CELL_M) -> mujoco.MjModel:
-    """A model with every wall built in: slow, and the truth that the movable boxes are tested against."""
+    """A model with all walls. It is slow; tests compare the movable boxes with it."""
     return static_spec(robot, np.frombuffer(walls, bool).reshape(height, width), cell_m).compile()
 
 
 def static_spec(robot: Robot, walls: Bool[np.ndarray, "h w"], cell_m: float) -> mujoco.MjSpec:
-    """The robot in a maze, to be compiled."""
+    """The specification of a model of the robot in a maze with all walls."""
     spec = mujoco.MjSpec.from_string(model_xml(robot))
     for row, column in np.argwhere(walls):
         body = spec.worldbody.add_body(pos=[(column + 0.5) * cell_m, (row + 0.5) * cell_m, WALL_HEIGHT_M / 2])

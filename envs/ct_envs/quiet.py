@@ -1,8 +1,8 @@
-"""Imports MuJoCo and MJX so that they do nothing unasked; for whoever imports them first.
+"""Import MuJoCo and MJX without side effects. Import this module before them.
 
-MJX would say on stdout that there is no warp, which we do not use. MuJoCo would write its warnings to MUJOCO_LOG.TXT in
-the current folder, and to stderr: they go to the logger ``ct_envs.mujoco`` as INFO. And it would not load at all where
-MUJOCO_GL names what is not installed, although physics draws nothing.
+MJX prints on stdout that warp is missing, which we do not use. MuJoCo writes warnings to stderr and to MUJOCO_LOG.TXT
+in the current folder; here they go to the logger ``ct_envs.mujoco`` with level INFO. MuJoCo cannot be imported if
+MUJOCO_GL names a backend that is not installed, although physics does not need one.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ _log = logging.getLogger("ct_envs.mujoco")
 
 @contextlib.contextmanager
 def _without_opengl() -> Iterator[None]:
-    """MuJoCo loads within as if MUJOCO_GL were off; afterwards, it has what that variable names, if it is there."""
+    """A context to import MuJoCo without OpenGL. Afterwards it has the backend of MUJOCO_GL, if that is installed."""
     wanted, platform = os.environ.get("MUJOCO_GL"), os.environ.get("PYOPENGL_PLATFORM")
     if not wanted or "mujoco" in sys.modules:
         yield
@@ -32,7 +32,7 @@ def _without_opengl() -> Iterator[None]:
 
     try:
         mujoco.GLContext = importlib.reload(gl_context).GLContext
-    except Exception:  # it fails in many ways, and has set this variable by then
+    except Exception:  # it raises many kinds of errors, after it has set this variable
         os.environ.pop("PYOPENGL_PLATFORM", None)
         if platform is not None:
             os.environ["PYOPENGL_PLATFORM"] = platform

@@ -1,4 +1,4 @@
-"""Robots as data: a model file and the few numbers that the worlds and the method need of it."""
+"""Robots as data: a model file, and the numbers that the worlds and the method need."""
 
 from dataclasses import dataclass
 from importlib import resources
@@ -9,25 +9,25 @@ from ct_envs.errors import UserError
 
 @dataclass(frozen=True)
 class Robot:
-    """What there is to know of a robot besides its MJCF model. SI units."""
+    """The data of a robot besides its model file. SI units."""
 
     name: str
-    xml: str  # file under assets/
-    radius_m: float  # of the smallest upright cylinder that the roadmap keeps clear of walls
-    touch_m: float  # farthest any part reaches from the centre: the nearest walls are looked for within it
-    top_speed_mps: float  # at most this fast, so that no wall is missed within a control step
-    control_dt_s: float  # a control step
+    xml: str  # file in assets/
+    radius_m: float  # radius of an upright cylinder around the robot, for the clearance of roadmaps
+    touch_m: float  # maximum distance of any part from the centre, for the search of the nearest walls
+    top_speed_mps: float  # upper limit of the speed, so that no wall is missed in a control step
+    control_dt_s: float  # duration of a control step
     horizon: int  # control steps of an episode
-    way_m: float  # longest way for which that horizon is meant; a longer one is given more steps, in proportion
-    cruise_mps: float  # along a shortest way, led by a planner with the full map (measured in antmaze-large-eval)
+    way_m: float  # length of the longest path for this horizon; longer paths get a longer horizon in proportion
+    cruise_mps: float  # mean speed along shortest paths, guided by the planner (measured in antmaze-large-eval)
     goal_tolerance_m: float = 0.5
     reset_velocity_mps: float = 0.0  # standard deviation of the speed after a reset
-    reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
-    upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
-    height_min_m: float | None = None  # height of the torso below which the robot has fallen
+    reset_joints_rad: float = 0.0  # maximum deviation of the joints from the standing pose after a reset
+    upright_min: float | None = None  # the robot has fallen if the cosine of the torso's tilt is below this
+    height_min_m: float | None = None  # the robot has fallen if the torso is lower than this
     controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
-    has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
-    course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
+    has_heading: bool = False  # the torso has a free joint, so the robot has a heading, which is random after a reset
+    course: str = "maze"  # its world: a "maze" in MuJoCo, or a cluttered "room" in PyBullet
 
 
 POINT = Robot(
@@ -93,7 +93,7 @@ ROBOTS = {robot.name: robot for robot in (POINT, ANT, HUMANOID, TURTLEBOT3)}
 
 
 def get_robot(name: str, course: str | None = None) -> Robot:
-    """The robot of that name. Raises UserError with the valid names, those of a ``course`` if one is given."""
+    """The robot with this name. Raises UserError with the valid names (of a ``course``, if given)."""
     known = [robot.name for robot in ROBOTS.values() if course in (None, robot.course)]
     if name not in known:
         where = f" for a {course}" if course else ""

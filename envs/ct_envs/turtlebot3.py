@@ -1,13 +1,13 @@
 """The Turtlebot3 burger in a cluttered room: one PyBullet simulation, on the CPU (paper, sec. IV-B).
 
-What a policy sees is what the robot itself can give it, in the robot's own frame (x ahead, y to the left): the
-direction of the goal [cos dpsi, sin dpsi], where dpsi is the angle from the heading to the goal; the vector to the goal
-(dx, dy); and the lidar within 1 m as a 2 x 25 x 25 map of 0.08 m cells. The paper gives neither the frame, nor the
-control step, the horizon, the goal tolerance or the penalty. In the robot's frame, raw lidar needs no estimate of the
-yaw, errors of the yaw move no obstacle, and nothing changes when the world is turned. The other choices are the
-defaults of ``Turtlebot3Config``.
+Observations contain only what the robot itself can measure, in its own frame (x ahead, y to the left): the direction of
+the goal [cos dpsi, sin dpsi], where dpsi is the angle from the heading to the goal; the vector to the goal (dx, dy);
+and the lidar within 1 m as a 2 x 25 x 25 map with cells of 0.08 m. The paper does not give the frame, the control step,
+the horizon, the goal tolerance and the penalty. In the robot's frame, the lidar map needs no estimate of the yaw,
+errors of the yaw do not move obstacles, and a rotation of the world changes nothing. The other choices are the defaults
+of ``Turtlebot3Config``.
 
-PyBullet is imported when the first simulation begins: all else works without it.
+PyBullet is imported when the first simulation starts. Everything else works without it.
 """
 
 import os
@@ -38,17 +38,17 @@ TOP_SPEED_MPS = TURTLEBOT3.top_speed_mps
 TOP_TURN_RADPS = 2.84
 PROPRIO_SIZE = 2  # cos dpsi, sin dpsi
 ACTION_SIZE = 2  # v, omega
-MAX_NOISE = 2.0  # more delay than a control step is not simulated
+MAX_NOISE = 2.0  # at this level the delay is one control step; longer delays are not simulated
 
-_STOP_M = 0.1  # with noise, a robot stops where it believes to be so near: half the tolerance is left to its drift
+_STOP_M = 0.1  # with noise, the robot stops at this estimated distance; half of the tolerance remains for drift
 _LIDAR_M = 0.18  # height of the beams: above the body, below the top of every obstacle
 _HEIGHT_M = 0.5  # of walls and obstacles
-_TORQUE_NM = 0.03  # of a motor: 1.8 m/s^2, so that the robot does not tip
-_SETTLE = 12  # physics steps in which a robot that was put down comes to rest
-_FRONTAL = np.cos(np.pi / 4)  # a contact within 45 degrees of the way the robot drives is frontal
+_TORQUE_NM = 0.03  # torque limit of a motor: 1.8 m/s^2, so that the robot does not tip over
+_SETTLE = 12  # physics steps until a robot is at rest after it was placed
+_FRONTAL = np.cos(np.pi / 4)  # a contact within 45 degrees of the direction of motion is frontal
 _RENDERER = "tinyRendererPlugin"
 _WHEELS = ("wheel_left_joint", "wheel_right_joint")
-# What may meet what: body and obstacles, wheels and floor, and rays (of group 1, that is PyBullet's) obstacles alone.
+# Collision groups: body with obstacles, wheels with the floor, and rays (PyBullet uses group 1) with obstacles.
 _RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
 
 
@@ -56,15 +56,15 @@ _RAY, _ROLLING, _BODY, _OBSTACLE, _FLOOR = 1, 2, 4, 8, 16
 class Turtlebot3Config(Checked):
     """The simulation and the task."""
 
-    control_dt_s: Annotated[float, Above(0, 10)] = TURTLEBOT3.control_dt_s  # between two actions
-    physics_dt_s: Annotated[float, Above(0, 10)] = 1 / 240  # between two steps of PyBullet
+    control_dt_s: Annotated[float, Above(0, 10)] = TURTLEBOT3.control_dt_s  # duration of a control step
+    physics_dt_s: Annotated[float, Above(0, 10)] = 1 / 240  # duration of a step of PyBullet
     horizon: Annotated[int, Within(1, 1_000_000)] = TURTLEBOT3.horizon  # control steps of an episode
     goal_tolerance_m: Annotated[float, Above(0, 100)] = TURTLEBOT3.goal_tolerance_m
-    collision_penalty: Annotated[float, Within(0, 1_000_000)] = 1.0  # taken off the reward of a step in which the robot
-    # touches something
-    urdf: str | None = None  # a URDF file instead of ours
-    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of what a real robot gets wrong, see
-    # ``turtlebot3_noise``; 1 is meant to be real
+    # Subtracted from the reward of a step in which the robot touches something.
+    collision_penalty: Annotated[float, Within(0, 1_000_000)] = 1.0
+    urdf: str | None = None  # a URDF file to use instead of ours
+    # Level of the errors of sensors and motion, see ``turtlebot3_noise``. 1 stands for a real robot.
+    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,26 +73,26 @@ class Turtlebot3Config(Checked):
 
     @property
     def substeps(self) -> int:
-        """Physics steps of a control step."""
+        """Physics steps per control step."""
         return round(self.control_dt_s / self.physics_dt_s)
 
 
 class Pose(NamedTuple):
-    """Where the middle of the robot's axle is, in the world. May have leading batch axes."""
+    """Pose of the middle of the robot's axle in the world frame. May have leading batch axes."""
 
     position: np.ndarray  # float64 [*b, 2], [m]
     yaw_rad: Any  # float [*b]
 
 
 class Touch(NamedTuple):
-    """What the robot touched during a control step."""
+    """The contacts of a control step."""
 
-    frontal: bool  # something in its way
-    grazing: bool  # something at its side, or behind it
+    frontal: bool  # in the direction of motion
+    grazing: bool  # at the side or behind
 
 
 class Step(NamedTuple):
-    """What a control step gives."""
+    """The result of a control step."""
 
     obs: dict[str, np.ndarray]
     reward: float
@@ -101,7 +101,7 @@ class Step(NamedTuple):
 
 
 def wheel_speeds(v_mps: Any, omega_radps: Any) -> Any:
-    """Speeds of the left and the right wheel [..., 2] (rad/s) at linear speed v and turning speed omega (sec. IV-B)."""
+    """Speeds of the left and right wheel [..., 2] (rad/s) for linear speed v and angular speed omega (sec. IV-B)."""
     v_mps, omega_radps = np.asarray(v_mps, np.float64), np.asarray(omega_radps, np.float64)
     left = (v_mps - omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M
     right = (v_mps + omega_radps * (WHEEL_SEPARATION_M / 2)) / WHEEL_RADIUS_M
@@ -109,7 +109,7 @@ def wheel_speeds(v_mps: Any, omega_radps: Any) -> Any:
 
 
 def speeds(action: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """(v, omega) [m/s, rad/s] of an action: in shares of the top speeds, clipped to [-1, 1]."""
+    """(v, omega) [m/s, rad/s] of an action. The action is in shares of the top speeds, and is clipped to [-1, 1]."""
     return np.clip(action, -1.0, 1.0) * np.array([TOP_SPEED_MPS, TOP_TURN_RADPS])
 
 
@@ -119,7 +119,7 @@ def as_action(v_mps: Any, omega_radps: Any) -> np.ndarray:
 
 
 def to_heading(vector: Float[np.ndarray, "*n 2"], yaw_rad: Any) -> Float[np.ndarray, "*n 2"]:
-    """A vector of the world in the frame of a robot with this yaw."""
+    """Transform a vector from the world frame to the frame of a robot with this yaw."""
     cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
     x, y = vector[..., 0], vector[..., 1]
     return np.stack([cosine * x + sine * y, cosine * y - sine * x], -1)
@@ -128,11 +128,11 @@ def to_heading(vector: Float[np.ndarray, "*n 2"], yaw_rad: Any) -> Float[np.ndar
 def observe(
     pose: Pose, goal: Float[np.ndarray, "*b 2"], ranges: Float[np.ndarray, "*b 360"], *, missing_ok: bool = False
 ) -> dict[str, np.ndarray]:
-    """What a policy sees: ``map`` [*b, 2, 25, 25] of bytes, ``proprio`` [cos dpsi, sin dpsi] and ``goal`` [*b, 2] (m).
+    """The observation: ``map`` [*b, 2, 25, 25] uint8, ``proprio`` [cos dpsi, sin dpsi] and ``goal`` [*b, 2] (m).
 
     Args:
-        pose: as the robot believes it to be; positions [*b, 2] (m), yaws [*b].
-        goal: in the world [m].
+        pose: the robot's estimate of its pose; positions [*b, 2] (m), yaws [*b].
+        goal: in the world frame [m].
         ranges: of the lidar [m]; see ``lidar_map``, also for ``missing_ok``.
     """
     ahead = to_heading(goal - pose.position, np.asarray(pose.yaw_rad))
@@ -143,19 +143,20 @@ def observe(
 
 
 class Turtlebot3Env:
-    """Reach the goal. Reward is minus the distance to it after the step [m], less a penalty where something is touched.
+    """Reach the goal. The reward is minus the distance to the goal after the step [m], minus a penalty for contacts.
 
-    Action: [-1, 1]^2, shares of 0.22 m/s and 2.84 rad/s. Observation: see ``observe``. An episode ends with success
-    (within the goal tolerance) or, as truncation, at the horizon; a collision does not end it. ``info`` holds
+    Action: [-1, 1]^2, shares of 0.22 m/s and 2.84 rad/s. Observation: see ``observe``. An episode ends with a success
+    (within the goal tolerance), or at the horizon (truncation). A collision does not end it. ``info`` holds
     ``success``, ``collision``, ``frontal``, ``grazing``, ``truncation``, ``episode_steps``, ``position``, ``yaw_rad``,
-    ``ranges``, the pose ``believed`` and ``believed_reward``, which feels no touch. With ``noise``, observations and
-    these three are what the robot has, all else is the truth, and an episode ends where the robot believes to have
-    arrived: with success, if it has. The same world, start, goal, seed and actions give the same episode, bit for bit,
-    whatever was simulated before.
+    ``ranges``, the estimated pose ``believed``, and ``believed_reward``, the estimated reward without the penalty. With
+    ``noise``, the observation and the last three contain the robot's errors; all other entries are exact. The episode
+    then ends when the robot estimates that it has reached the goal. It is a success if the true position is within the
+    goal tolerance. The same world, start, goal, seed and actions give exactly the same episode, in any order of
+    episodes.
     """
 
     def __init__(self, config: Turtlebot3Config = Turtlebot3Config()):
-        """Raises UserError where PyBullet or the URDF is missing, or the URDF is broken."""
+        """Raises UserError if PyBullet or the URDF is missing, or if the URDF is damaged."""
         self.config = config
         self._urdf = _urdf_file(config.urdf)
         self._bullet = load_pybullet()
@@ -182,10 +183,10 @@ class Turtlebot3Env:
         """The first observation of an episode from ``start`` to ``goal`` [2] (m).
 
         Args:
-            seed: of what is left to chance: the yaw, where none is given.
+            seed: random seed of the noise, and of the yaw if none is given.
 
         Raises:
-            UserError: a start or goal where the robot cannot stand, or a goal it cannot reach.
+            UserError: a start or goal in an obstacle or too close to it, or a goal that the robot cannot reach.
         """
         start, goal = (np.asarray(point, np.float64) for point in (start, goal))
         check_task(world, start, goal)
@@ -199,7 +200,7 @@ class Turtlebot3Env:
         return obs
 
     def step(self, action: Any) -> Step:
-        """One control step. Raises UserError for an action that is not two finite numbers, or after the end."""
+        """One control step. Raises UserError if the action is not two finite numbers, or if the episode is over."""
         action = np.asarray(action, np.float64)
         if action.shape != (2,) or not np.isfinite(action).all():
             raise UserError(f"the action {action.tolist()} is not two finite numbers; give shares of (v, omega)")
@@ -223,7 +224,7 @@ class Turtlebot3Env:
         return Step(obs, -distance - self.config.collision_penalty * collision, self._done, info)
 
     def _see(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The observation, and what it was made of."""
+        """The observation, and the ranges and the pose from which it was computed."""
         if not self.config.noise:
             pose, ranges = self.pose, self.lidar()
         else:
@@ -233,19 +234,19 @@ class Turtlebot3Env:
         return obs, {"ranges": ranges, "believed": pose}
 
     def sight(self) -> dict[str, Any]:
-        """``info`` as far as it is known before the first step."""
+        """The entries of ``info`` that exist before the first step."""
         pose = self.pose
         return {"position": pose.position, "yaw_rad": pose.yaw_rad, **self._sight}
 
     @property
     def pose(self) -> Pose:
-        """Where the robot is."""
+        """The true pose of the robot."""
         position, quat = self._bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._client)
         x, y, z, w = quat
         return Pose(np.array(position[:2]), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
 
     def lidar(self) -> np.ndarray:
-        """Ranges [360] (m): beam i is i degrees to the left of the heading; ``LIDAR_RANGE_M`` where nothing is met."""
+        """Ranges [360] (m). Beam i points i degrees to the left of the heading. No hit gives ``LIDAR_RANGE_M``."""
         position, yaw = self.pose
         angle = yaw + np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS)
         begin = np.tile(np.append(position, _LIDAR_M), (LIDAR_BEAMS, 1))
@@ -254,12 +255,13 @@ class Turtlebot3Env:
         return LIDAR_RANGE_M * np.array([hit[2] for hit in hits])
 
     def _drop_renderer(self) -> None:
-        """Unload the renderer, which nothing here draws with: a quarter of a simulation's memory is its pictures."""
-        if (renderer := self._bullet.loadPlugin(_RENDERER, physicsClientId=self._client)) >= 0:  # the one there is
+        """Unload the renderer. We do not use it, and its images take a quarter of the memory of a simulation."""
+        # If the renderer is loaded, ``loadPlugin`` returns its number.
+        if (renderer := self._bullet.loadPlugin(_RENDERER, physicsClientId=self._client)) >= 0:
             self._bullet.unloadPlugin(renderer, physicsClientId=self._client)
 
     def _build(self, world: World, start: np.ndarray, yaw_rad: float) -> None:
-        """Everything anew: an old simulation's caches would make the episode depend on the one before."""
+        """Build the whole simulation again. Old caches would make an episode depend on the episode before it."""
         p, client = self._bullet, {"physicsClientId": self._client}
         p.resetSimulation(**client)
         p.setPhysicsEngineParameter(
@@ -279,7 +281,7 @@ class Turtlebot3Env:
             p.stepSimulation(**client)
 
     def _put(self, shape: int, x: float, y: float, yaw: float) -> None:
-        """An obstacle that does not move."""
+        """Add a fixed obstacle."""
         p, client = self._bullet, {"physicsClientId": self._client}
         quat = p.getQuaternionFromEuler([0.0, 0.0, yaw])
         body = p.createMultiBody(0, shape, -1, [x, y, _HEIGHT_M / 2], quat, **client)
@@ -309,7 +311,7 @@ class Turtlebot3Env:
         self._command(0.0, 0.0)
 
     def _command(self, v_mps: float, omega_radps: float, roll: Any = 1.0) -> None:
-        """Turn the wheels; ``roll`` is how much faster than asked for each of them carries the robot."""
+        """Set the speeds of the wheels. ``roll`` scales the speed of each wheel: it is the error of its motion."""
         p = self._bullet
         speeds = (wheel_speeds(v_mps, omega_radps) * roll).tolist()
         p.setJointMotorControlArray(
@@ -318,13 +320,13 @@ class Turtlebot3Env:
         )  # fmt: skip
 
     def _drive(self, v_mps: float, omega_radps: float) -> Touch:
-        """Hold the wheels' speeds for a control step, and tell what was touched."""
+        """Drive for one control step with constant speeds; returns the contacts."""
         assert self._world is not None
         before, asked = self._odometry(), np.array([v_mps, omega_radps])
         roll = self._belief.roll() if self.config.noise else np.ones(2)
         late = round(min(self._belief.latency_s, self.config.control_dt_s) / self.config.physics_dt_s)
         self._command(*(self._asked if late else asked), roll=roll)
-        # How far the robot could come: where nothing is that near, nobody need look for contacts.
+        # The distance that the robot can reach in this step. Contacts are only computed if an obstacle is closer.
         reach = RADIUS_M + 1.5 * TOP_SPEED_MPS * self.config.control_dt_s + 0.02
         near = float(self._world.clearance(self.pose.position)) < reach
         frontal = grazing = False
@@ -342,12 +344,12 @@ class Turtlebot3Env:
         return Touch(frontal, grazing)
 
     def _odometry(self) -> tuple[np.ndarray, float]:
-        """What the wheels have rolled so far [2] (m), and the yaw [rad]."""
+        """The distances that the wheels have rolled [2] (m), and the yaw [rad]."""
         states = self._bullet.getJointStates(self._robot, self._wheels, physicsClientId=self._client)
         return WHEEL_RADIUS_M * np.array([state[0] for state in states]), self.pose.yaw_rad
 
     def _touching(self, direction: float) -> Touch:
-        """Contacts of the body now, by their normals; ``direction`` is -1 where the robot drives backwards."""
+        """The current contacts of the body, classified by their normals. ``direction`` is -1 when driving backwards."""
         contacts = self._bullet.getContactPoints(bodyA=self._robot, linkIndexA=-1, physicsClientId=self._client)
         pressed = [contact[7] for contact in contacts if contact[9] > 0.0]
         if not pressed:
@@ -359,20 +361,20 @@ class Turtlebot3Env:
 
 
 def check_task(world: World, start: np.ndarray, goal: np.ndarray) -> None:
-    """Raises UserError for a start or goal [2] (m) where the robot cannot stand, or a goal it cannot reach."""
+    """Raise UserError if start or goal [2] (m) is too close to an obstacle, or if the robot cannot reach the goal."""
     for name, point in (("start", start), ("goal", goal)):
         if point.shape != (2,) or not np.isfinite(point).all():
             raise UserError(f"the {name} {point.tolist()} is not a point; give x and y in metres")
         if float(world.clearance(point)) < RADIUS_M:
             x, y = point
-            raise UserError(f"the {name} ({x:.2f}, {y:.2f}) is in an obstacle or wall, or too near; move it away")
+            raise UserError(f"the {name} ({x:.2f}, {y:.2f}) is in an obstacle or wall, or too near to one; move it")
     if not world.reachable(start, goal, RADIUS_M):
         x, y = goal
         raise UserError(f"the goal ({x:.2f}, {y:.2f}) is out of the robot's reach from this start; move one of them")
 
 
 def load_pybullet() -> ModuleType:
-    """PyBullet. Raises UserError where it is not installed."""
+    """Import PyBullet. Raises UserError if it is not installed."""
     try:
         with _quiet():
             import pybullet
@@ -386,7 +388,7 @@ def load_pybullet() -> ModuleType:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps what C code writes to stdout and stderr from the terminal: PyBullet greets, and warns of what is well."""
+    """A context that hides the output of C code: PyBullet prints a greeting and needless warnings."""
     streams = sys.stdout, sys.stderr
     for stream in streams:
         stream.flush()
@@ -406,18 +408,18 @@ def _quiet() -> Iterator[None]:
 
 
 def _urdf_file(name: str | None) -> Path:
-    """The URDF, looked through. Raises UserError where it is missing, or lacks the wheels."""
+    """The path of the URDF. Raises UserError if the file is missing, is not XML, or has no joints for the wheels."""
     path = Path(name or str(resources.files("ct_envs") / "assets" / TURTLEBOT3.xml))
     if not path.is_file():
         raise UserError(f"no URDF file '{path}'; leave urdf out to use the Turtlebot3's own")
     try:
         robot = xml.fromstring(path.read_bytes())
     except xml.ParseError as bad:
-        raise UserError(f"{path}:{bad.position[0]}: not XML ({bad.msg.split(':')[0]}); mend that line") from None
+        raise UserError(f"{path}:{bad.position[0]}: not XML ({bad.msg.split(':')[0]}); correct this line") from None
     joints = {joint.get("name") for joint in robot.iter("joint")}
     missing = [name for name in _WHEELS if name not in joints]
     if missing:
-        raise UserError(f"{path}: has no joint {' and no '.join(missing)}; the wheels' joints must be named so")
+        raise UserError(f"{path}: has no joint {' and no '.join(missing)}; give the joints of the wheels these names")
     return path
 
 

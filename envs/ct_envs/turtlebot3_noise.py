@@ -1,8 +1,8 @@
 """The errors of a real Turtlebot3: slipping wheels, drifting odometry, a noisy lidar, late commands. NumPy only.
 
-One ``level`` scales all of them. Level 1 stands for a well-kept robot on a smooth floor. Each magnitude is the standard
-deviation of an error, with its reason beside it. The simulation keeps the true state; this file gives the robot's
-estimates.
+One ``level`` scales all errors. Level 1 stands for a robot in good condition on a smooth floor. Each magnitude is the
+standard deviation of an error; its comment gives the reason. The simulation has the true state; this file computes the
+robot's estimates.
 """
 
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ LIDAR_BLIND_M = 0.12  # the LDS-01 measures nothing closer than this (its data s
 class Noise:
     """Magnitudes at level 1."""
 
-    wheel: float = 0.01  # share of a wheel's radius, for the whole episode: 0.3 mm of 33 mm, from wear and load
-    slip: float = 0.03  # share of what a wheel rolls in a control step: rubber on a smooth floor
-    gyro_scale: float = 0.01  # share of each turn, for the whole episode: typical of an uncalibrated MEMS gyroscope
-    gyro_bias_radps: float = np.radians(0.05)  # for the whole episode: the rest after calibration at standstill
+    wheel: float = 0.01  # share of a wheel's radius, constant in an episode: 0.3 mm of 33 mm, from wear and load
+    slip: float = 0.03  # share of the distance that a wheel rolls in a control step: rubber on a smooth floor
+    gyro_scale: float = 0.01  # share of each turn, constant in an episode: typical of an uncalibrated MEMS gyroscope
+    gyro_bias_radps: float = np.radians(0.05)  # constant in an episode: the remaining bias after calibration at rest
     gyro_walk: float = np.radians(0.1)  # random walk of the yaw [rad per square root of a second]
-    near_m: float = 0.010  # of a range below 0.5 m: the LDS-01's precision (its data sheet)
-    far: float = 0.035  # of a longer range, as a share of it (likewise)
-    dropped: float = 0.02  # share of beams that do not come back: dark and slanting surfaces
-    latency_s: float = 0.1  # from a scan to the wheels: half a turn of the lidar, which turns five times a second
+    near_m: float = 0.010  # error of ranges below 0.5 m: the precision of the LDS-01 (data sheet)
+    far: float = 0.035  # error of longer ranges, as a share of the range (data sheet)
+    dropped: float = 0.02  # share of beams that do not come back: dark or slanted surfaces
+    latency_s: float = 0.1  # from a scan to the wheels: half a turn of the lidar, at five turns per second
 
 
 class Belief:
@@ -48,7 +48,7 @@ class Belief:
         return self._level * self._noise.latency_s
 
     def roll(self) -> Float[np.ndarray, "2"]:
-        """How far the left and right wheel really roll in the next control step, relative to their encoders."""
+        """The true motion of the left and right wheel in the next control step, relative to their encoders."""
         self._roll = 1.0 + self._wheels + self._level * self._noise.slip * self._rng.standard_normal(2)
         return self._roll
 
@@ -62,10 +62,10 @@ class Belief:
         self.yaw_rad += turn
 
     def scan(self, ranges: Float[np.ndarray, "360"]) -> Float[np.ndarray, "360"]:
-        """A scan with the lidar's errors; infinity if a beam did not come back.
+        """A scan with the errors of the lidar. Beams that do not come back have an infinite range.
 
-        A beam without a hit within ``LIDAR_RANGE_M`` is not changed: its true range is unknown, and an error subtracted
-        from the limit would create an obstacle.
+        A beam without a hit within ``LIDAR_RANGE_M`` is not changed: its true range is unknown, and a negative error
+        would create an obstacle at the end of the range.
         """
         sigma = self._level * np.where(ranges < 0.5, self._noise.near_m, self._noise.far * ranges)
         seen = np.maximum(ranges + sigma * self._rng.standard_normal(ranges.shape), 1e-3)

@@ -1,9 +1,9 @@
-"""Several Turtlebot3 simulations side by side, in worker processes with PyBullet clients of their own.
+"""Several Turtlebot3 simulations in parallel, in worker processes with their own PyBullet clients.
 
-All slots are stepped together. An episode depends on nothing but its world, start, goal, seed and actions, so the
-number of processes changes nothing; and where a process dies, another one takes its place and drives its episodes
-again up to where they were: who uses the pool does not notice, but for the time it takes. A slot takes 9 MB, and a
-process 70 MB besides.
+All slots are stepped together. An episode depends only on its world, start, goal, seed and actions, so the number of
+processes does not affect the results. If a process dies, a new process replaces it, and repeats the actions of its
+episodes up to the current step. The results do not change; it only takes time. A slot takes 9 MB of memory, and a
+process takes another 70 MB.
 
 Processes are spawned, so a script that makes a pool needs ``if __name__ == "__main__":``.
 """
@@ -27,34 +27,34 @@ from ct_envs.memory import zeros_given_back
 from ct_envs.turtlebot3 import Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_world import World
 
-MAX_DEATHS = 5  # of one process, during one step, until the pool gives up
+MAX_DEATHS = 5  # the pool gives up after this number of deaths of one process in one step
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What an episode begins with."""
+    """The initial conditions of an episode."""
 
     world: World
     start: np.ndarray  # [2], [m]
     goal: np.ndarray  # [2], [m]
     seed: int = 0
-    yaw_rad: float | None = None  # by default drawn from the seed
+    yaw_rad: float | None = None  # if None, it is drawn with the seed
 
 
 class Frame(NamedTuple):
-    """What is seen and known after a step; in a batch, with a leading axis N."""
+    """The observation and the state after a step; in a batch with a leading axis N."""
 
     map: np.ndarray  # uint8 [2, 25, 25]
     proprio: np.ndarray  # float32 [2]: cos dpsi, sin dpsi
     goal: np.ndarray  # float32 [2]: vector to the goal [m]
     position: np.ndarray  # float64 [2], in the world [m]
     yaw_rad: np.ndarray  # float64
-    believed_position: np.ndarray  # float64 [2], where the robot believes to be; the truth, without noise [m]
+    believed_position: np.ndarray  # float64 [2], the robot's estimate; equal to ``position`` without noise [m]
     believed_yaw_rad: np.ndarray  # float64
     ranges: np.ndarray  # float32 [360], [m]
     reward: np.ndarray  # float32
-    believed_reward: np.ndarray  # float32: as the robot can tell by itself, which feels no touch
-    done: np.ndarray  # bool, as all that follow
+    believed_reward: np.ndarray  # float32: the robot's estimate, without the collision penalty
+    done: np.ndarray  # bool; the following fields, too
     success: np.ndarray
     collision: np.ndarray
     frontal: np.ndarray
@@ -69,24 +69,24 @@ _EMPTY = Frame(
 
 
 class Turtlebot3Pool:
-    """N slots, each for one episode at a time. A context manager: leaving it ends the processes."""
+    """N slots, each for one episode at a time. It is a context manager, which ends the processes on exit."""
 
     def __init__(self, n: int, *, processes: int | None = None, config: Turtlebot3Config = Turtlebot3Config()):
         """
         Args:
-            n: slots.
-            processes: by default as many as there are cores, and at most n.
+            n: number of slots.
+            processes: number of processes; the default is the number of cores, but at most n.
 
         Raises:
-            UserError: no slot or process, or what ``Turtlebot3Env`` raises.
+            UserError: n or ``processes`` is less than 1; see also ``Turtlebot3Env``.
         """
         processes = min(n, os.cpu_count() or 1) if processes is None else processes
         if min(n, processes) < 1:
             raise UserError(f"a pool of {n} Turtlebot3 in {processes} processes; use at least one of each")
-        load_pybullet()  # its errors are a user's to read; in a process they would be deaths
+        load_pybullet()  # raise its errors here; in a worker they would look like deaths
         self.n, self.config = n, config
         self._frames = [_EMPTY] * n
-        self._logs: dict[int, tuple[Episode, list[np.ndarray]]] = {}  # by slot: how to come to where it is
+        self._logs: dict[int, tuple[Episode, list[np.ndarray]]] = {}  # by slot: the episode and its actions so far
         self._workers: list[_Worker] = []
         self._asking = False
         try:
@@ -104,20 +104,20 @@ class Turtlebot3Pool:
 
     @property
     def pids(self) -> list[int]:
-        """The worker processes."""
+        """The ids of the worker processes."""
         return [worker.process.pid or -1 for worker in self._workers]
 
     def close(self) -> None:
-        """End the processes, whatever they are at."""
+        """End the processes at once."""
         for worker in self._workers:
             worker.end()
         self._workers = []
 
     def reset(self, episodes: Sequence[Episode], slots: Sequence[int] | None = None) -> Frame:
-        """Begin episodes, by default in the first slots; frames of all N. A slot never begun counts as done.
+        """Start episodes, by default in the first slots; returns the frames of all N slots. An unused slot is done.
 
         Raises:
-            UserError: more episodes than slots, or what ``Turtlebot3Env.reset`` raises; these slots are then empty.
+            UserError: more episodes than slots; see also ``Turtlebot3Env.reset``. The slots are then empty.
         """
         slots = range(len(episodes)) if slots is None else slots
         if len(episodes) != len(set(slots)) or not set(slots) <= set(range(self.n)):
@@ -131,10 +131,10 @@ class Turtlebot3Pool:
         return self._keep(frames)
 
     def step(self, actions: np.ndarray) -> Frame:
-        """One control step of all N episodes with actions [N, 2]; those that are done stay as they are.
+        """One control step of all N episodes with actions [N, 2]. Finished episodes do not change.
 
         Raises:
-            UserError: actions of another shape, or not finite ones for an episode that is not done.
+            UserError: the actions have another shape, or are not finite for an unfinished episode.
         """
         actions = np.asarray(actions, np.float64)
         live = [slot for slot, frame in enumerate(self._frames) if not frame.done]
@@ -153,10 +153,10 @@ class Turtlebot3Pool:
         return Frame(*(np.stack(leaves) for leaves in zip(*self._frames, strict=True)))
 
     def _ask(self, command: str, content: dict[int, Any]) -> dict[int, Frame]:
-        """The frames of the slots asked for, from the workers that have them."""
+        """Send a command to the workers of the given slots; returns the frames of these slots."""
         if not self._workers:
             raise UserError("the Turtlebot3 pool is closed; make a new one")
-        if self._asking:  # an interrupt or an error left answers in the pipes
+        if self._asking:  # after an interrupt or an error, old answers are still in the pipes
             for number in range(len(self._workers)):
                 self._replace(number)
         self._asking = True
@@ -166,14 +166,14 @@ class Turtlebot3Pool:
         for number, request in requests.items():
             self._workers[number].send(command, request)
         answers = [self._answer(number, command, request) for number, request in requests.items()]
-        self._asking = any(kind != "frames" for kind, _ in answers)  # if of what was driven again, one more is to come
+        self._asking = any(kind != "frames" for kind, _ in answers)  # an error of a replay: one more answer will follow
         for kind, answer in answers:
             if kind != "frames":
                 raise (UserError if kind == "error" else RuntimeError)(answer)
         return {slot: frame for _, answer in answers for slot, frame in answer.items()}
 
     def _answer(self, number: int, command: str, request: dict[int, Any]) -> tuple[str, Any]:
-        """A worker's answer; if it died, its successor's."""
+        """A worker's answer, or its successor's if it died."""
         for _ in range(MAX_DEATHS):
             try:
                 return self._workers[number].connection.recv()
@@ -181,12 +181,12 @@ class Turtlebot3Pool:
                 self._replace(number)
                 self._workers[number].send(command, request)
         raise UserError(
-            f"a Turtlebot3 process died {MAX_DEATHS} times in one step; is there memory for {self.n} simulations, and "
-            'an `if __name__ == "__main__":` in the script? use fewer slots'
+            f"a Turtlebot3 process died {MAX_DEATHS} times in one step; use fewer slots if {self.n} simulations do not "
+            'fit in memory, and put `if __name__ == "__main__":` in the script'
         )
 
     def _replace(self, number: int) -> None:
-        """A new worker, with the old one's episodes driven again."""
+        """Start a new worker, which repeats the episodes of the old one."""
         self._workers[number].end()
         self._workers[number] = _start(self.config)
         mine = {slot: log for slot, log in self._logs.items() if slot % len(self._workers) == number}
@@ -199,11 +199,11 @@ class _Worker:
     connection: Connection
 
     def send(self, command: str, content: dict[int, Any]) -> None:
-        with suppress(OSError):  # it died: whoever waits for its answer will see
+        with suppress(OSError):  # the worker died: ``_answer`` will notice
             self.connection.send((command, content))
 
     def end(self) -> None:
-        if self.connection.closed:  # ended before, and no other could be started in its place
+        if self.connection.closed:  # it was ended before, and its successor could not be started
             return
         self.connection.close()
         self.process.kill()
@@ -215,7 +215,7 @@ def _start(config: Turtlebot3Config) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, config), daemon=True, name="turtlebot3")
-    with _no_interrupts():  # inherited: a worker must not die of a Ctrl-C before it can ignore it
+    with _no_interrupts():  # the worker inherits this, so that Ctrl-C cannot kill it before it ignores SIGINT
         process.start()
     theirs.close()
     return _Worker(process, ours)
@@ -231,7 +231,7 @@ def _no_interrupts() -> Iterator[None]:
 
 
 def _work(connection: Connection, config: Turtlebot3Config) -> None:
-    """A worker's life: answer until the pool is gone. Ctrl-C is the pool's to handle."""
+    """The loop of a worker: answer requests until the pool is closed. The pool handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     envs: dict[int, Turtlebot3Env] = {}
     while True:
@@ -256,7 +256,7 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
     frames = {}
     for slot, episode in episodes.items():
         if slot not in envs:
-            with zeros_given_back():  # this thread is the process's only one that works
+            with zeros_given_back():  # no other thread of this process is active
                 envs[slot] = Turtlebot3Env(config)
         env = envs[slot]
         obs = env.reset(episode.world, episode.start, episode.goal, seed=episode.seed, yaw_rad=episode.yaw_rad)

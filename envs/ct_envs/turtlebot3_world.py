@@ -1,7 +1,7 @@
 """Cluttered rooms for the Turtlebot3: a square of walls with boxes and cylinders in it (paper, sec. IV-B). NumPy only.
 
-Coordinates are SI: x right, y up, the room's lower-left corner at (0, 0). The paper says neither how large its rooms
-are nor how full; ours are 5 m x 5 m, and 5 to 10 % of the floor is covered in training.
+Coordinates are in metres: x right, y up, and the lower-left corner of the room is (0, 0). The paper gives neither the
+size nor the density of its rooms. Ours are 5 m x 5 m, and obstacles cover 5 to 10 % of the floor in training.
 """
 
 import functools
@@ -18,27 +18,27 @@ from ct_envs.errors import UserError
 
 SIDE_M = 5.0  # of a random room
 TRAIN_DENSITY = (0.05, 0.10)  # share of the floor that obstacles cover, in training
-MAX_DENSITY = 0.25  # more does not fit without overlap
-HALF_SIZE_M = (0.1, 0.3)  # half sides of boxes and radii of cylinders, drawn between these
-REGION_CELL_M = 0.05  # of the grid on which it is told what can be reached
-MARGIN_M = 0.05  # room around the robot at starts and goals that are drawn
+MAX_DENSITY = 0.25  # higher densities do not fit without overlap
+HALF_SIZE_M = (0.1, 0.3)  # range of the half sides of boxes and of the radii of cylinders
+REGION_CELL_M = 0.05  # cell size of the grid for reachability
+MARGIN_M = 0.05  # clearance beyond the robot's radius at random starts and goals
 
-_MAX_BYTES = 1_000_000  # of a world file
+_MAX_BYTES = 1_000_000  # maximum size of a world file
 _BOX = ("x_m", "y_m", "half_x_m", "half_y_m", "yaw_rad")
 _CYLINDER = ("x_m", "y_m", "radius_m")
 _POSITIVE = ("half_x_m", "half_y_m", "radius_m")
 
 
-@dataclass(frozen=True, eq=False)  # equal and hashed by identity: what is derived from a world is cached
+@dataclass(frozen=True, eq=False)  # hashed by identity, for the cache of ``_regions``
 class World:
-    """A square room. Its walls are the sides of ``[0, side_m] x [0, side_m]``; whatever is outside is not free."""
+    """A square room. Its walls are the sides of ``[0, side_m] x [0, side_m]``. Points outside are not free."""
 
     side_m: float
     boxes: np.ndarray  # float [B, 5]: centre x, y, half sides along and across, yaw [m, rad]
     cylinders: np.ndarray  # float [C, 3]: centre x, y, radius [m]
 
     def clearance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Signed distance [m] from points [m] to the nearest wall or obstacle: exact outside them, below 0 inside."""
+        """Signed distance [m] from points [m] to the nearest wall or obstacle: exact outside, negative inside."""
         points = np.asarray(points, np.float64)
         nearest = np.minimum(points, self.side_m - points).min(-1)
         local, half = self._in_boxes(points), self.boxes[:, 2:4]
@@ -48,7 +48,7 @@ class World:
         return np.minimum(nearest, np.concatenate([to_box, to_cylinder], -1).min(-1, initial=np.inf))
 
     def segment_clearance(self, a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Distance [m] from the segments a-b to the nearest wall or obstacle, exact; not above 0 where they touch."""
+        """Exact distance [m] from the segments a-b to the nearest wall or obstacle; 0 or negative if they touch."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         nearest = np.minimum(np.minimum(a, b), self.side_m - np.maximum(a, b)).min(-1)
         to_box = _segment_to_box(self._in_boxes(a), self._in_boxes(b), self.boxes[:, 2:4])
@@ -62,7 +62,7 @@ class World:
         return (room >= radius) & (room > 0)
 
     def sample_free(self, rng: np.random.Generator, n: int, radius: float) -> Float[np.ndarray, "n 2"]:
-        """n points [m], uniform over the area with clearance ``radius`` [m]. Raises UserError if there is none."""
+        """n points [m], uniform over the area with clearance ``radius`` [m]. Raises UserError if there are too few."""
         kept: list[np.ndarray] = []
         for _ in range(100):
             draw = rng.uniform(radius, max(self.side_m - radius, radius), (4 * n, 2))
@@ -74,10 +74,10 @@ class World:
     def sample_pair(
         self, rng: np.random.Generator, radius: float, *, margin_m: float = MARGIN_M, apart_m: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A start and a goal [2] (m) of one region that the robot can cross, at least ``apart_m`` from each other.
+        """A start and a goal [2] (m) in the same region for the robot, at least ``apart_m`` from each other.
 
         Raises:
-            UserError: no two such points were found.
+            UserError: no such points were found.
         """
         regions = _regions(self, radius + REGION_CELL_M / 2)
         for _ in range(20):
@@ -91,28 +91,28 @@ class World:
         raise UserError(f"no start and goal {apart_m} m apart in one free region; use fewer or smaller obstacles")
 
     def regions(self, points: np.ndarray, radius: float) -> np.ndarray:
-        """Free regions, int [k], of points [k, 2] (m): a robot can cross the gaps inside one. 0 is no such region.
+        """The free regions, int [k], of points [k, 2] (m). A robot can reach all points of its region; 0 is not free.
 
-        Told on a grid of 5 cm, in which gaps count as blocked that are up to 5 cm wider than the robot.
+        It is computed on a grid of 5 cm. Gaps that are up to 5 cm wider than the robot may count as blocked.
         """
         return _regions(self, radius + REGION_CELL_M / 2).of(np.asarray(points, np.float64))
 
     def reachable(self, start: np.ndarray, goal: np.ndarray, radius: float) -> bool:
-        """Whether a robot may be able to go from start to goal [2] (m), where it can stand.
+        """Whether a robot may be able to go from start to goal [2] (m). If False, it is certainly impossible.
 
-        Told on a grid of 5 cm, in which gaps count as free that are up to 7 cm too narrow; what can be reached is.
+        It is computed on a grid of 5 cm. Gaps that are up to 7 cm too narrow may count as free.
         """
         ends = np.asarray([start, goal], np.float64)
         start_label, goal_label = _regions(self, radius - REGION_CELL_M * 2**-0.5).of(ends)
         return bool(start_label == goal_label and start_label > 0)
 
     def covered(self) -> float:
-        """Share of the floor that the obstacles cover, overlap counted twice."""
+        """Share of the floor that the obstacles cover. Overlap counts twice."""
         area = 4.0 * np.prod(self.boxes[:, 2:4], axis=1).sum() + np.pi * (self.cylinders[:, 2] ** 2).sum()
         return float(area / self.side_m**2)
 
     def _in_boxes(self, points: np.ndarray) -> np.ndarray:
-        """Points [*n, 2] as seen from each box, [*n, B, 2]."""
+        """Points [*n, 2] in the frame of each box, [*n, B, 2]."""
         away = points[..., None, :] - self.boxes[:, :2]
         cosine, sine = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
         along, across = away[..., 0] * cosine + away[..., 1] * sine, away[..., 1] * cosine - away[..., 0] * sine
@@ -126,7 +126,7 @@ def make_world(boxes: Any = (), cylinders: Any = (), *, side_m: float = SIDE_M) 
         UserError: a number that is not finite, a size that is not positive, or an obstacle outside the room.
     """
     if not (np.isfinite(side_m) and 0.5 <= side_m <= 100.0):
-        raise UserError(f"a room of side {side_m} m; use 0.5 to 100")
+        raise UserError(f"the room has side {side_m} m; use 0.5 to 100 m")
     tables = {}
     for kind, fields, rows in (("boxes", _BOX, boxes), ("cylinders", _CYLINDER, cylinders)):
         table = np.asarray(rows, np.float64).reshape(-1, len(fields))
@@ -142,11 +142,12 @@ def make_world(boxes: Any = (), cylinders: Any = (), *, side_m: float = SIDE_M) 
 
 
 def random_world(seed: int | tuple[int, ...], density: float | None = None, *, side_m: float = SIDE_M) -> World:
-    """A room with boxes and cylinders of random place, width and yaw, none overlapping another.
+    """A room with boxes and cylinders of random position, size and yaw, without overlap.
 
     Args:
         seed: the same seed gives the same world on every machine.
-        density: share of the floor that obstacles cover, to half an obstacle; None draws it from ``TRAIN_DENSITY``.
+        density: share of the floor that obstacles cover, with an error of up to half an obstacle. If None, it is drawn
+            from ``TRAIN_DENSITY``.
 
     Raises:
         UserError: a density below 0 or above ``MAX_DENSITY``.
@@ -173,7 +174,7 @@ def random_world(seed: int | tuple[int, ...], density: float | None = None, *, s
 
 
 def _place(rng: np.random.Generator, radius: float, others: list, side_m: float) -> np.ndarray:
-    """A centre at which a disc of ``radius`` is inside the room and meets no other."""
+    """A random centre at which a disc of ``radius`` is inside the room and does not overlap others."""
     for _ in range(10_000):
         centre = rng.uniform(radius, side_m - radius, 2)
         if all(np.hypot(*(centre - other)) > radius + reach for other, reach, _ in others):
@@ -185,7 +186,7 @@ def _place(rng: np.random.Generator, radius: float, others: list, side_m: float)
 
 
 def save_world(world: World, file: str | Path) -> None:
-    """Write a world as JSON, one obstacle a line."""
+    """Write a world as JSON, with one obstacle per line."""
 
     def rows(table: np.ndarray, fields: tuple[str, ...]) -> str:
         lines = [json.dumps(dict(zip(fields, row, strict=True))) for row in table.tolist()]
@@ -197,7 +198,7 @@ def save_world(world: World, file: str | Path) -> None:
 
 
 def load_world(file: str | Path) -> World:
-    """Read a world file, as ``save_world`` writes it. Raises UserError that names the file, the place and the mend."""
+    """Read a world file written by ``save_world``. Raises UserError with the file, the place and the remedy."""
     path = Path(file)
     if not path.is_file():
         raise UserError(f"no world file '{path}'; save_world(random_world(0), file) writes one")
@@ -209,7 +210,7 @@ def load_world(file: str | Path) -> World:
         raise UserError(f"{path}: not UTF-8 text; save the world as JSON") from None
     except (json.JSONDecodeError, RecursionError) as bad:
         line = getattr(bad, "lineno", 1)
-        raise UserError(f"{path}:{line}: not JSON ({getattr(bad, 'msg', 'too deep')}); mend that line") from None
+        raise UserError(f"{path}:{line}: not JSON ({getattr(bad, 'msg', 'too deep')}); correct this line") from None
     names = {"side_m", "boxes", "cylinders"}
     if not isinstance(content, dict) or set(content) != names:
         raise UserError(f"{path}: not a world; it needs just {', '.join(sorted(names))}")
@@ -243,13 +244,13 @@ def _number(value: Any, name: str) -> float:
 
 @dataclass(frozen=True)
 class _Regions:
-    """Connected regions of grid cells whose centres have the clearance asked for."""
+    """Connected regions of grid cells whose centres have a given clearance."""
 
     labels: np.ndarray  # int [n, n], row y, column x; 0 is not free
     cell_m: float
 
     def of(self, points: np.ndarray) -> np.ndarray:
-        """Region of each point [m, 2]: of its cell, or of a free one beside it; 0 if there is none."""
+        """Region of each point [m, 2]: that of its cell, or of a free cell beside it; 0 if there is none."""
         column, row = np.floor(points / self.cell_m).astype(int).T
         padded = np.pad(self.labels, 2)
         side = (0, -1, 1)
@@ -280,7 +281,7 @@ def _segment_to_box(a: np.ndarray, b: np.ndarray, half: np.ndarray) -> np.ndarra
     signs = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
     to_corner = functools.reduce(np.minimum, (_segment_to_point(a - sign * half, b - sign * half) for sign in signs))
     to_end = np.minimum(*(np.linalg.norm(np.maximum(np.abs(end) - half, 0.0), axis=-1) for end in (a, b)))
-    # The slab test: where along the segment it is inside on both axes.
+    # The slab test: the part of the segment that is inside the box on both axes.
     along = b - a
     safe = np.where(np.abs(along) < 1e-12, 1e-12, along)
     t1, t2 = (-half - a) / safe, (half - a) / safe
