@@ -8,6 +8,7 @@ similar size share one compiled program. Everything outside the array is wall.
 
 import functools
 import json
+import logging
 import os
 from collections.abc import Callable, Sequence
 from importlib import resources
@@ -26,8 +27,8 @@ from ct_envs.errors import UserError
 PAD = 12  # arrays are padded to a multiple of this many cells
 CELL_M = 4.0  # side of a cell [m], as in D4RL's ant mazes
 MAX_SIDE = 1024  # most cells along a side of a maze file
-_MAX_BYTES = 8 * MAX_SIDE * (MAX_SIDE + 2)  # as JSON with each cell on a line of its own
 WALL, FREE = "#", "."
+_LOG = logging.getLogger(__name__)
 
 
 class Marks(NamedTuple):
@@ -133,34 +134,47 @@ def maze_names() -> list[str]:
 
 
 def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
-    """Load a named layout, or a maze file as ``parse_walls`` reads it.
+    """Load a named layout, or any map that ``ct_envs.maps.read_map`` reads, as a maze with cells of ``cell_m`` [m].
+
+    A named layout, and a file that does not say how large its cells are, is taken to have cells of that size. A map
+    that says so is brought to cells of ``cell_m``: a cell is free only if all of it is free.
 
     Raises:
         UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the mend).
     """
-    return make_maze(load_walls(name_or_file), cell_m=cell_m)
+    return make_maze(load_walls(name_or_file, cell_m=cell_m), cell_m=cell_m)
 
 
-def load_walls(name_or_file: str | Path) -> np.ndarray:
-    """The wall grid of a named layout or maze file, bool [H, W], row 0 lowest, no padding. Raises as ``load_maze``."""
+def load_walls(name_or_file: str | Path, *, cell_m: float = CELL_M) -> np.ndarray:
+    """The wall grid of a named layout or map file, bool [H, W], row 0 lowest, no padding. As ``load_maze``."""
     name = str(name_or_file)
     if name in maze_names():
         text = (resources.files("ct_envs") / "mazes" / f"{name}.txt").read_text("utf-8")
         return parse_walls(text, source=name)
-    path = Path(name)
     if not os.path.isfile(name):  # unlike Path.is_file, it takes names that no file can have
         raise UserError(f"no maze or file named '{name}'; named mazes: {', '.join(maze_names())}")
-    if path.stat().st_size > _MAX_BYTES:
-        raise UserError(f"{path}: too large for a maze; at most {MAX_SIDE} x {MAX_SIDE} cells")
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError as bad:
-        line = bad.object[: bad.start].count(b"\n") + 1
-        raise UserError(f"{path}:{line}: not UTF-8 text; save the maze as plain text of '#' and '.'") from None
-    return parse_walls(text, source=str(path))
+    from ct_envs import maps  # which imports this module
+
+    found = maps.read_map(name)
+    for note in found.notes:
+        _LOG.warning(note)
+    walls = close_walls(found.with_cells(cell_m).walls)
+    if walls.all():
+        raise UserError(f"{name}: {maps.why_no_cell(found, cell_m)}")
+    if max(walls.shape) > MAX_SIDE:
+        height, width = walls.shape
+        raise UserError(f"{name}: {height} x {width} cells of {cell_m:g} m; at most {MAX_SIDE} x {MAX_SIDE}")
+    return walls
 
 
-def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
+def close_walls(walls: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
+    """The grid with walls all around: with one more ring of cells, if one at the border is free."""
+    inner = np.ones_like(walls)
+    inner[1:-1, 1:-1] = walls[1:-1, 1:-1]
+    return walls if (walls == inner).all() else np.pad(walls, 1, constant_values=True)
+
+
+def parse_walls(text: str, *, source: str = "maze", most: int = MAX_SIDE) -> np.ndarray:
     """Parse maze text to bool [H, W], row 0 lowest.
 
     A line is a row of cells, the first one on top: all of them of ``#`` (wall) and ``.`` (free), or all of ``1``
@@ -168,6 +182,10 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     line, and blank lines above and below the maze are ignored. So is a comment: ``#``, a space, and text with a letter
     and without another ``#``. No row is taken for one, even if it was drawn with spaces: a row has two walls.
     Text that begins with ``[`` is JSON: a nested list, as ``make_maze`` reads it.
+
+    Args:
+        source: what errors call the text.
+        most: cells along a side.
 
     Raises:
         UserError: empty, ragged, unknown character, no JSON, all wall, or free cells on the border.
@@ -179,18 +197,19 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     if not rows:
         raise UserError(f"{source}: empty; a maze is lines of '#' (wall) and '.' (free)")
     (first, top), widest = rows[0], max(len(row) for _, row in rows)
-    if max(widest, len(rows)) > MAX_SIDE:  # before a look at each of its cells
-        raise UserError(f"{source}: {len(rows)} x {widest} cells; at most {MAX_SIDE} x {MAX_SIDE}")
+    if max(widest, len(rows)) > most:  # before a look at each of its cells
+        raise UserError(f"{source}: {len(rows)} x {widest} cells; at most {most} x {most}")
     marks = LISTED if top[:1] and top[0] in (LISTED.wall, *LISTED.free) else DRAWN
     known = {marks.wall, *marks.free}
     for number, row in rows:
-        for column, char in enumerate(row, 1):
-            if char not in known:
-                raise UserError(f"{source}:{number}: column {column} is {char!r}; use {marks}")
+        if strange := set(row) - known:
+            column = min(map(row.index, strange))
+            raise UserError(f"{source}:{number}: column {column + 1} is {row[column]!r}; use {marks}")
         if len(row) != len(top):
             mend = f"line {first} has {len(top)}; make all lines equal"
             raise UserError(f"{source}:{number}: {len(row)} cells, but {mend}")
-    walls = np.array([[char == marks.wall for char in row] for _, row in rows])
+    drawn = "".join(row for _, row in rows).encode("ascii")
+    walls = np.frombuffer(drawn, np.uint8).reshape(len(rows), len(top)) == ord(marks.wall)
     _check_closed(walls, marks, source, lambda row, column: f"{source}:{rows[row][0]}: column {column + 1}")
     return walls[::-1]
 
