@@ -46,11 +46,28 @@ LISTED = Marks("1", "0rgc")  # Gymnasium-Robotics' maps also mark where resets (
 
 
 @struct.dataclass
+class Boxes:
+    """What a maze with cells smaller than a robot's reach needs besides: see ``ct_envs.fine.fit_maze``.
+
+    Its walls are merged into R boxes. The floor is divided into h x w tiles; for each, ``near`` lists the boxes that a
+    robot in it could touch in a control step. Box R, the last, is none.
+    """
+
+    sides: Float[Array, "*b R+1 4"]  # left, bottom, right, top of each box [m]
+    near: Int[Array, "*b h w B"]
+    tile_m: Float[Array, "*b"]  # side of a tile [m]
+    window_m: Float[Array, "*b"]  # boxes are cut off so far from the robot along each axis [m]
+    room_m: Float[Array, "*b H W"]  # distance from the centre of a cell to the nearest wall [m], 0 in walls
+    counts: Int[Array, "*b H+1 W+1"]  # number of wall cells below and left of each corner
+
+
+@struct.dataclass
 class Maze:
     """A maze, or a batch of them with leading axes.
 
     Free cells are listed region by region (4-connected), so that a goal that can be reached from a start is one
-    random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``.
+    random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``. With ``boxes``,
+    only those cells are listed at whose centre the robot has room.
     """
 
     walls: Bool[Array, "*b H W"]
@@ -59,6 +76,7 @@ class Maze:
     region_hi: Int[Array, "*b HW"]
     n_free: Int[Array, "*b"]
     cell_m: Float[Array, "*b"]
+    boxes: Boxes | None = None  # where cells are small
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -94,23 +112,25 @@ def make_maze(
     padded = np.ones((height, width), bool)
     padded[: walls.shape[0], : walls.shape[1]] = walls
 
-    labels, _ = label_regions(~padded)
-    flat = np.flatnonzero(~padded)
+    return Maze(walls=jnp.asarray(padded), **list_cells(~padded), cell_m=jnp.asarray(cell_m, jnp.float32))
+
+
+def list_cells(free: Bool[np.ndarray, "H W"]) -> dict[str, jax.Array]:
+    """The fields of a ``Maze`` that list its free cells, region by region."""
+    labels, _ = label_regions(free)
+    flat = np.flatnonzero(free)
     flat = flat[np.argsort(labels.ravel()[flat], kind="stable")]
     label = labels.ravel()[flat]
-    n, total = len(flat), height * width
 
     def pad(values: np.ndarray) -> jax.Array:
-        return jnp.asarray(np.pad(values, (0, total - n)), jnp.int32)
+        return jnp.asarray(np.pad(values, (0, free.size - len(flat))), jnp.int32)
 
-    return Maze(
-        walls=jnp.asarray(padded),
-        free_cells=pad(flat),
-        region_lo=pad(np.searchsorted(label, label, "left")),
-        region_hi=pad(np.searchsorted(label, label, "right")),
-        n_free=jnp.asarray(n, jnp.int32),
-        cell_m=jnp.asarray(cell_m, jnp.float32),
-    )
+    return {
+        "free_cells": pad(flat),
+        "region_lo": pad(np.searchsorted(label, label, "left")),
+        "region_hi": pad(np.searchsorted(label, label, "right")),
+        "n_free": jnp.asarray(len(flat), jnp.int32),
+    }
 
 
 def label_regions(free: np.ndarray) -> tuple[np.ndarray, int]:
@@ -119,7 +139,9 @@ def label_regions(free: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def stack_mazes(mazes: list[Maze]) -> Maze:
-    """Stack mazes along a new leading axis, padding all to the largest shape."""
+    """Stack mazes along a new leading axis, padding all to the largest shape. Raises UserError for small cells."""
+    if any(maze.boxes is not None for maze in mazes):
+        raise UserError("mazes with cells smaller than a robot's reach cannot be stacked; use larger cells")
     shape = (max(m.shape[0] for m in mazes), max(m.shape[1] for m in mazes))
     grown = [make_maze(np.asarray(m.walls), cell_m=float(m.cell_m), shape=shape) for m in mazes]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grown)
@@ -393,7 +415,16 @@ def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
 
 
 def clearance(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
-    """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall."""
+    """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall.
+
+    With ``boxes``: a lower bound that is at most 1.5 cells too small, however far the wall is.
+    """
+    if maze.boxes is not None:
+        row, column = (cell := cell_of(maze, point))
+        height, width = maze.shape
+        room = maze.boxes.room_m[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+        beside = jnp.linalg.norm((cell[::-1] + 0.5) * maze.cell_m - point)
+        return jnp.where(is_wall(maze, cell), 0.0, jnp.maximum(room - beside, 0.0))
     cells = cell_of(maze, point)[None] + _neighbourhood(1)
     low = cells[:, ::-1] * maze.cell_m
     outside = jnp.maximum(jnp.maximum(low - point[None], point[None] - low - maze.cell_m), 0.0)
@@ -406,9 +437,15 @@ def segment_free(
 ) -> Bool[Array, ""]:
     """Whether a disc of ``radius`` [m] swept from ``a`` to ``b`` touches no wall (exact, not sampled).
 
+    With ``boxes`` it is free for certain where this says so; a way with two cells more room is always found free.
+
     Args:
         reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
     """
+    if maze.boxes is not None:  # points half a cell apart or less: between two, clearance changes by a quarter at most
+        points = a + jnp.linspace(0.0, 1.0, 4 * reach + 1)[:, None] * (b - a)
+        room = jax.vmap(clearance, (None, 0))(maze, points)
+        return jnp.min(room) - jnp.linalg.norm(b - a) / (8 * reach) >= jnp.maximum(radius, 1e-6)
     # Each coordinate by itself: on CPU, XLA then needs a sixth of the time.
     middle, offset = cell_of(maze, (a + b) / 2), _neighbourhood(reach)
     row, column = (middle[i] + offset[:, i] for i in (0, 1))
@@ -472,7 +509,8 @@ def sample_free(
     """A random point with clearance ``radius`` [m], and the index of its cell in ``maze.free_cells``.
 
     The cell is uniform over the free ones, or over the region of ``free_cells[index]`` if that is given; the point is
-    uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are.
+    uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are. With
+    ``boxes`` it is uniform over a square around the cell's centre, as large as the walls leave.
     """
     return _place(jax.random.uniform(key, (3,), jnp.float32), maze, radius, index)
 
@@ -490,5 +528,9 @@ def _place(
     """``sample_free`` from three numbers in [0, 1)."""
     low, high = (0, maze.n_free) if index is None else (maze.region_lo[index], maze.region_hi[index])
     chosen = jnp.minimum(low + (chance[0] * (high - low)).astype(jnp.int32), high - 1)
-    slack = maze.cell_m / 2 - radius - 1e-3
+    if maze.boxes is None:
+        slack = maze.cell_m / 2 - radius - 1e-3
+    else:  # the corners of the square, too, are clear of walls
+        room = maze.boxes.room_m.ravel()[maze.free_cells[chosen]]
+        slack = jnp.clip((room - radius) / np.sqrt(2.0) - 1e-3, 0.0, maze.cell_m / 2)
     return cell_centre(maze, maze.free_cells[chosen]) + (2.0 * chance[1:] - 1.0) * slack, chosen

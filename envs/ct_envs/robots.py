@@ -29,6 +29,11 @@ class Robot:
     has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
     course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
 
+    @property
+    def reach_m(self) -> float:
+        """How far from its centre it can touch something within a control step [m]."""
+        return self.touch_m + self.top_speed_mps * self.control_dt_s
+
 
 POINT = Robot(
     name="point",
