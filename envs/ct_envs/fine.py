@@ -15,12 +15,24 @@ from scipy import ndimage
 
 from ct_envs.errors import UserError
 from ct_envs.maps import read_map
-from ct_envs.maze import CELL_M, MAX_SIDE, Boxes, Maze, list_cells, load_walls, make_maze, maze_names
+from ct_envs.maze import (
+    CELL_M,
+    EXACT_REACH,
+    MAX_SIDE,
+    Boxes,
+    Maze,
+    list_cells,
+    load_walls,
+    make_maze,
+    maze_names,
+    segment_reach,
+)
 from ct_envs.physics import window_m
 from ct_envs.robots import Robot
 
 _LENGTHS = (8, 16, 32, 64, 128, 256)  # of the lists of boxes
 _TILES = 4  # a robot's reach, in tiles
+_WAY_M = 10.0  # straight ways that planners ask about are about so long [m]: edges of roadmaps
 
 
 def load_fitted(name_or_file: str | Path, robot: Robot) -> Maze:
@@ -35,7 +47,7 @@ def fit_maze(walls: Bool[np.ndarray, "h w"], robot: Robot, *, cell_m: float) -> 
     """A maze for one robot, whatever the size of its cells.
 
     A robot that reaches less than half a cell in a step gets the maze of ``make_maze``. For any other, the maze has
-    ``boxes``, and its free cells are those at whose centre the robot has room.
+    ``boxes``, and its free cells are those at whose centre the robot has room, with a margin of up to two cells.
 
     Args:
         walls: row 0 lowest, closed.
@@ -51,7 +63,10 @@ def fit_maze(walls: Bool[np.ndarray, "h w"], robot: Robot, *, cell_m: float) -> 
     if max(padded.shape) > MAX_SIDE + 12:
         raise UserError(f"maze of {padded.shape} cells; at most {MAX_SIDE} x {MAX_SIDE}, use larger cells")
     room = wall_distance(padded) * cell_m
-    free = room >= robot.radius_m  # then the straight ways between the centres of neighbours are free, too
+    # A robot that has room at the centres of two neighbours can go straight from one to the other. Where ways are too
+    # long to be looked at cell by cell, they are found if there is more room.
+    margin_m = 2 * cell_m if segment_reach(_WAY_M, robot.radius_m, cell_m) > EXACT_REACH else 0.0
+    free = room >= robot.radius_m + margin_m
     if not free.any():
         mend = f"its widest place has radius {room.max():.2f} m"
         raise UserError(f"maze with cells of {cell_m:g} m: no free space for robot '{robot.name}'; {mend}")

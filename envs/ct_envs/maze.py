@@ -27,6 +27,7 @@ from ct_envs.errors import UserError
 PAD = 12  # arrays are padded to a multiple of this many cells
 CELL_M = 4.0  # side of a cell [m], as in D4RL's ant mazes
 MAX_SIDE = 1024  # most cells along a side of a maze file
+EXACT_REACH = 16  # cells to each side that are looked at one by one; farther ways through small cells are sampled
 WALL, FREE = "#", "."
 _LOG = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class Maze:
 
     Free cells are listed region by region (4-connected), so that a goal that can be reached from a start is one
     random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``. With ``boxes``,
-    only those cells are listed at whose centre the robot has room.
+    only those cells are listed at whose centre the robot has room enough that queries find its ways.
     """
 
     walls: Bool[Array, "*b H W"]
@@ -417,19 +418,24 @@ def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
 def clearance(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
     """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall.
 
-    With ``boxes``: a lower bound that is at most 1.5 cells too small, however far the wall is.
+    With ``boxes`` it goes on from one cell: there it is at most 1.5 cells too small, however far the wall is.
     """
-    if maze.boxes is not None:
-        row, column = (cell := cell_of(maze, point))
-        height, width = maze.shape
-        room = maze.boxes.room_m[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
-        beside = jnp.linalg.norm((cell[::-1] + 0.5) * maze.cell_m - point)
-        return jnp.where(is_wall(maze, cell), 0.0, jnp.maximum(room - beside, 0.0))
     cells = cell_of(maze, point)[None] + _neighbourhood(1)
     low = cells[:, ::-1] * maze.cell_m
     outside = jnp.maximum(jnp.maximum(low - point[None], point[None] - low - maze.cell_m), 0.0)
     distance = jnp.sqrt(jnp.sum(outside**2, -1))
-    return jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
+    near = jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
+    return near if maze.boxes is None else jnp.maximum(near, _room(maze, point))
+
+
+def _room(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance [m] from a point to the nearest wall of a maze with ``boxes``, or up to 1.5 cells less."""
+    assert maze.boxes is not None
+    row, column = (cell := cell_of(maze, point))
+    height, width = maze.shape
+    room = maze.boxes.room_m[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+    beside = jnp.linalg.norm((cell[::-1] + 0.5) * maze.cell_m - point)
+    return jnp.where(is_wall(maze, cell), 0.0, jnp.maximum(room - beside, 0.0))
 
 
 def segment_free(
@@ -437,14 +443,17 @@ def segment_free(
 ) -> Bool[Array, ""]:
     """Whether a disc of ``radius`` [m] swept from ``a`` to ``b`` touches no wall (exact, not sampled).
 
-    With ``boxes`` it is free for certain where this says so; a way with two cells more room is always found free.
+    With ``boxes`` and a ``reach`` above ``EXACT_REACH`` it is free for certain where this says so; and a way that is
+    two cells wider at each side is always found free.
 
     Args:
         reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
     """
-    if maze.boxes is not None:  # points half a cell apart or less: between two, clearance changes by a quarter at most
+    if (
+        maze.boxes is not None and reach > EXACT_REACH
+    ):  # points half a cell apart or less: between two, clearance changes by a quarter at most
         points = a + jnp.linspace(0.0, 1.0, 4 * reach + 1)[:, None] * (b - a)
-        room = jax.vmap(clearance, (None, 0))(maze, points)
+        room = jax.vmap(_room, (None, 0))(maze, points)
         return jnp.min(room) - jnp.linalg.norm(b - a) / (8 * reach) >= jnp.maximum(radius, 1e-6)
     # Each coordinate by itself: on CPU, XLA then needs a sixth of the time.
     middle, offset = cell_of(maze, (a + b) / 2), _neighbourhood(reach)
