@@ -1,4 +1,4 @@
-"""The command line: ``ct-jax train | evaluate | report | mazes``."""
+"""The command line: ``ct-jax train | evaluate | report | mazes | maps``."""
 
 import contextlib
 import functools
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 from tyro.conf import (
@@ -181,7 +181,37 @@ class Mazes:
     """List the named mazes, each with a small picture."""
 
 
-COMMANDS = {"train": Train, "evaluate": Evaluate, "report": Report, "mazes": Mazes}
+@dataclass(frozen=True)
+class Maps:
+    """Look at a map that somebody else made, or convert it to our text or to a map_server map.
+
+    FILE is a map_server YAML, a picture of a floor plan, a MovingAI .map, a nested list (JSON), or our own text.
+
+    examples:
+      ct-jax maps show floor.yaml --picture floor.png
+      ct-jax maps convert floor.yaml floor.txt --cell-m 0.5 --scale 8
+      ct-jax maps convert plan.png plan.yaml --resolution 0.05
+    """
+
+    action: Annotated[Positional[Literal["show", "convert"]], arg(metavar="show|convert")]
+    """Show what is in a map, or write it to another file."""
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The map."""
+    out: Annotated[Positional[Path | None], arg(metavar="[OUT]", help_behavior_hint="(with convert)")] = None
+    """File to write: .txt for our text, or .yaml for map_server, with a .pgm beside it."""
+    resolution: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: as the file says)")] = None
+    """Side of a cell or pixel [m], for a file that does not say."""
+    cell_m: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: as they are)")] = None
+    """Bring the map to cells of this side [m]. A cell is free only if all of it is free."""
+    scale: Annotated[float, arg(metavar="F")] = 1.0
+    """Make all lengths so many times as long, after that: a building becomes a maze for larger robots."""
+    radius_m: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: any)")] = None
+    """Refuse a map that has no free space for a robot of this radius [m]."""
+    picture: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    """Draw the map: a .png file."""
+
+
+COMMANDS = {"train": Train, "evaluate": Evaluate, "report": Report, "mazes": Mazes, "maps": Maps}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -251,7 +281,7 @@ def _run(arguments: list[str]) -> None:
     command = _parse([argument for argument in arguments if argument != ALL_SETTINGS])
     if ALL_SETTINGS in arguments:
         return _print_settings(command)
-    {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes}[type(command)](command)
+    {Train: _train, Evaluate: _evaluate, Report: _report, Mazes: _mazes, Maps: _maps}[type(command)](command)
 
 
 def _fail(reason: Any) -> int:
@@ -274,7 +304,7 @@ def _how_to_go_on(arguments: list[str]) -> str:
 # --------------------------------------------------------------------------------------------------------- parsing
 
 
-def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes:
+def _parse(arguments: list[str]) -> Train | Evaluate | Report | Mazes | Maps:
     """Parse the command line with tyro. Raises UserError with a text of one line."""
     chosen = arguments[0] if arguments else ""
 
@@ -581,6 +611,34 @@ def _mazes(command: Mazes) -> None:
         return Panel(text, title=name, expand=False)
 
     _console().print(Columns([picture(name) for name in maze_names()]))
+
+
+def _maps(command: Maps) -> None:
+    if (command.action == "convert") != (command.out is not None):
+        raise UserError("give OUT with convert, and only there: ct-jax maps convert FILE OUT")
+    if command.picture is not None and command.picture.suffix.lower() != ".png":
+        raise UserError(f"--picture {command.picture}: give a .png file")
+    check_stdout()
+    _import_jax()
+    from ct_envs import maps
+    from ct_jax.files import check_writable, whole
+
+    found = maps.read_map(command.file, cell_m=command.resolution)
+    found = found if command.cell_m is None else found.with_cells(command.cell_m)
+    found = found if command.scale == 1 else found.scaled(command.scale)
+    for note in found.notes:
+        _say(f"note: {one_line(note)}")
+    if command.radius_m is not None:
+        found.check_room(command.radius_m)
+    files = {} if command.out is None else maps.converted(found, command.out)
+    files |= {} if command.picture is None else {command.picture: maps.png_of(found)}
+    check_writable(*files)
+    for file, content in files.items():
+        with whole(file) as opened:
+            opened.write(content)
+    for line in maps.in_words(found):
+        print(printable(line))
+    print(maps.small_picture(found) if command.out is None else f"written: {', '.join(map(printable, files))}")
 
 
 # ----------------------------------------------------------------------------------------------------------- table

@@ -11,8 +11,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
-from ct_envs.maze import maze_names
+from ct_envs.maze import load_walls, maze_names
 from ct_jax import __version__, cli, pipeline
 from ct_jax.cli import main
 from ct_jax.settings import Settings
@@ -60,6 +61,21 @@ def test_table_shows_divergence_only_if_it_occurred(capsys, rates, shown):
     cli.print_rows([row | ({} if rate is None else {"diverged_rate": rate}) for rate in rates])
     out = capsys.readouterr().out
     assert ("diverged %" in out) == shown and ("25" in out) == shown
+
+
+def test_evaluate_takes_a_map_that_somebody_else_made(tiny_run, islands, tmp_path, capsys):
+    """Drawn finely, with a scale: the same maze, and so the same row."""
+    walls = load_walls(islands)[::-1].repeat(8, 0).repeat(8, 1)
+    Image.fromarray(np.where(walls, 0, 255).astype(np.uint8)).save(tmp_path / "floor.png")
+    settings = {"image": "floor.png", "resolution": 0.5, "origin": [1, 2, 0], "negate": 0}
+    file = tmp_path / "floor.yaml"
+    file.write_text(json.dumps(settings | {"occupied_thresh": 0.65, "free_thresh": 0.196}))
+    rows = []
+    for maze in (islands, file):
+        assert main(["evaluate", str(tiny_run.folder), "--maze", str(maze), "--episodes", "3", "--json"]) == 0
+        rows.append(json.loads(capsys.readouterr().out))
+    for name in set(ROW) - {"wall_s", "maze"}:
+        assert rows[0][name] == pytest.approx(rows[1][name]), name
 
 
 def test_json_is_only_output_on_stdout(tiny_run, islands):
@@ -157,6 +173,7 @@ def test_version(capsys):
         ),
         (["report"], ["RUN", "ct-jax report runs/demo"]),
         (["mazes"], ["ct-jax mazes"]),
+        (["maps"], ["show|convert", "FILE", "--resolution", "--cell-m", "--scale", "--picture", "examples:"]),
         (["train"], ["mjx is some 30 times slower", "hosts that you trust"]),
         (["evaluate"], ["mjx is some 30 times slower"]),
     ],

@@ -8,6 +8,7 @@ similar size share one compiled program. Everything outside the array is wall.
 
 import functools
 import json
+import logging
 import os
 from collections.abc import Callable, Sequence
 from importlib import resources
@@ -26,8 +27,9 @@ from ct_envs.errors import UserError
 PAD = 12  # arrays are padded to a multiple of this many cells
 CELL_M = 4.0  # side of a cell [m], as in D4RL's ant mazes
 MAX_SIDE = 1024  # most cells along a side of a maze file
-_MAX_BYTES = 8 * MAX_SIDE * (MAX_SIDE + 2)  # as JSON with each cell on a line of its own
+EXACT_REACH = 16  # cells to each side that are looked at one by one; farther ways through small cells are sampled
 WALL, FREE = "#", "."
+_LOG = logging.getLogger(__name__)
 
 
 class Marks(NamedTuple):
@@ -45,11 +47,28 @@ LISTED = Marks("1", "0rgc")  # Gymnasium-Robotics' maps also mark where resets (
 
 
 @struct.dataclass
+class Boxes:
+    """What a maze with cells smaller than a robot's reach needs besides: see ``ct_envs.fine.fit_maze``.
+
+    Its walls are merged into R boxes. The floor is divided into h x w tiles; for each, ``near`` lists the boxes that a
+    robot in it could touch in a control step. Box R, the last, is none.
+    """
+
+    sides: Float[Array, "*b R+1 4"]  # left, bottom, right, top of each box [m]
+    near: Int[Array, "*b h w B"]
+    tile_m: Float[Array, "*b"]  # side of a tile [m]
+    window_m: Float[Array, "*b"]  # boxes are cut off so far from the robot along each axis [m]
+    room_m: Float[Array, "*b H W"]  # distance from the centre of a cell to the nearest wall [m], 0 in walls
+    counts: Int[Array, "*b H+1 W+1"]  # number of wall cells below and left of each corner
+
+
+@struct.dataclass
 class Maze:
     """A maze, or a batch of them with leading axes.
 
     Free cells are listed region by region (4-connected), so that a goal that can be reached from a start is one
-    random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``.
+    random integer away: the region of ``free_cells[i]`` is ``free_cells[region_lo[i]:region_hi[i]]``. With ``boxes``,
+    only those cells are listed at whose centre the robot has room enough that queries find its ways.
     """
 
     walls: Bool[Array, "*b H W"]
@@ -58,6 +77,7 @@ class Maze:
     region_hi: Int[Array, "*b HW"]
     n_free: Int[Array, "*b"]
     cell_m: Float[Array, "*b"]
+    boxes: Boxes | None = None  # where cells are small
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,23 +113,25 @@ def make_maze(
     padded = np.ones((height, width), bool)
     padded[: walls.shape[0], : walls.shape[1]] = walls
 
-    labels, _ = label_regions(~padded)
-    flat = np.flatnonzero(~padded)
+    return Maze(walls=jnp.asarray(padded), **list_cells(~padded), cell_m=jnp.asarray(cell_m, jnp.float32))
+
+
+def list_cells(free: Bool[np.ndarray, "H W"]) -> dict[str, jax.Array]:
+    """The fields of a ``Maze`` that list its free cells, region by region."""
+    labels, _ = label_regions(free)
+    flat = np.flatnonzero(free)
     flat = flat[np.argsort(labels.ravel()[flat], kind="stable")]
     label = labels.ravel()[flat]
-    n, total = len(flat), height * width
 
     def pad(values: np.ndarray) -> jax.Array:
-        return jnp.asarray(np.pad(values, (0, total - n)), jnp.int32)
+        return jnp.asarray(np.pad(values, (0, free.size - len(flat))), jnp.int32)
 
-    return Maze(
-        walls=jnp.asarray(padded),
-        free_cells=pad(flat),
-        region_lo=pad(np.searchsorted(label, label, "left")),
-        region_hi=pad(np.searchsorted(label, label, "right")),
-        n_free=jnp.asarray(n, jnp.int32),
-        cell_m=jnp.asarray(cell_m, jnp.float32),
-    )
+    return {
+        "free_cells": pad(flat),
+        "region_lo": pad(np.searchsorted(label, label, "left")),
+        "region_hi": pad(np.searchsorted(label, label, "right")),
+        "n_free": jnp.asarray(len(flat), jnp.int32),
+    }
 
 
 def label_regions(free: np.ndarray) -> tuple[np.ndarray, int]:
@@ -118,7 +140,9 @@ def label_regions(free: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def stack_mazes(mazes: list[Maze]) -> Maze:
-    """Stack mazes along a new leading axis, padding all to the largest shape."""
+    """Stack mazes along a new leading axis, padding all to the largest shape. Raises UserError for small cells."""
+    if any(maze.boxes is not None for maze in mazes):
+        raise UserError("mazes with cells smaller than a robot's reach cannot be stacked; use larger cells")
     shape = (max(m.shape[0] for m in mazes), max(m.shape[1] for m in mazes))
     grown = [make_maze(np.asarray(m.walls), cell_m=float(m.cell_m), shape=shape) for m in mazes]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grown)
@@ -133,34 +157,47 @@ def maze_names() -> list[str]:
 
 
 def load_maze(name_or_file: str | Path, *, cell_m: float = CELL_M) -> Maze:
-    """Load a named layout, or a maze file as ``parse_walls`` reads it.
+    """Load a named layout, or any map that ``ct_envs.maps.read_map`` reads, as a maze with cells of ``cell_m`` [m].
+
+    A named layout, and a file that does not say how large its cells are, is taken to have cells of that size. A map
+    that says so is brought to cells of ``cell_m``: a cell is free only if all of it is free.
 
     Raises:
         UserError: unknown name, missing file, or a file that is not a maze (names the file, the line, the hint).
     """
-    return make_maze(load_walls(name_or_file), cell_m=cell_m)
+    return make_maze(load_walls(name_or_file, cell_m=cell_m), cell_m=cell_m)
 
 
-def load_walls(name_or_file: str | Path) -> np.ndarray:
-    """The wall grid of a named layout or maze file, bool [H, W], row 0 lowest, no padding. Raises as ``load_maze``."""
+def load_walls(name_or_file: str | Path, *, cell_m: float = CELL_M) -> np.ndarray:
+    """The wall grid of a named layout or map file, bool [H, W], row 0 lowest, no padding. As ``load_maze``."""
     name = str(name_or_file)
     if name in maze_names():
         text = (resources.files("ct_envs") / "mazes" / f"{name}.txt").read_text("utf-8")
         return parse_walls(text, source=name)
-    path = Path(name)
     if not os.path.isfile(name):  # unlike Path.is_file, it takes names that no file can have
         raise UserError(f"no maze or file named '{name}'; named mazes: {', '.join(maze_names())}")
-    if path.stat().st_size > _MAX_BYTES:
-        raise UserError(f"{path}: too large for a maze; at most {MAX_SIDE} x {MAX_SIDE} cells")
-    try:
-        text = path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError as bad:
-        line = bad.object[: bad.start].count(b"\n") + 1
-        raise UserError(f"{path}:{line}: not UTF-8 text; save the maze as plain text of '#' and '.'") from None
-    return parse_walls(text, source=str(path))
+    from ct_envs import maps  # which imports this module
+
+    found = maps.read_map(name)
+    for note in found.notes:
+        _LOG.warning(note)
+    walls = close_walls(found.with_cells(cell_m).walls)
+    if walls.all():
+        raise UserError(f"{name}: {maps.why_no_cell(found, cell_m)}")
+    if max(walls.shape) > MAX_SIDE:
+        height, width = walls.shape
+        raise UserError(f"{name}: {height} x {width} cells of {cell_m:g} m; at most {MAX_SIDE} x {MAX_SIDE}")
+    return walls
 
 
-def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
+def close_walls(walls: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
+    """The grid with walls all around: with one more ring of cells, if one at the border is free."""
+    inner = np.ones_like(walls)
+    inner[1:-1, 1:-1] = walls[1:-1, 1:-1]
+    return walls if (walls == inner).all() else np.pad(walls, 1, constant_values=True)
+
+
+def parse_walls(text: str, *, source: str = "maze", most: int = MAX_SIDE) -> np.ndarray:
     """Parse maze text to bool [H, W], row 0 lowest.
 
     A line is a row of cells, the first one on top: all of them of ``#`` (wall) and ``.`` (free), or all of ``1``
@@ -168,6 +205,10 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     line, and blank lines above and below the maze are ignored. So is a comment: ``#``, a space, and text with a letter
     and without another ``#``. No row is taken for one, even if it was drawn with spaces: a row has two walls.
     Text that begins with ``[`` is JSON: a nested list, as ``make_maze`` reads it.
+
+    Args:
+        source: what errors call the text.
+        most: cells along a side.
 
     Raises:
         UserError: empty, ragged, unknown character, no JSON, all wall, or free cells on the border.
@@ -179,18 +220,19 @@ def parse_walls(text: str, *, source: str = "maze") -> np.ndarray:
     if not rows:
         raise UserError(f"{source}: empty; a maze is lines of '#' (wall) and '.' (free)")
     (first, top), widest = rows[0], max(len(row) for _, row in rows)
-    if max(widest, len(rows)) > MAX_SIDE:  # before a look at each of its cells
-        raise UserError(f"{source}: {len(rows)} x {widest} cells; at most {MAX_SIDE} x {MAX_SIDE}")
+    if max(widest, len(rows)) > most:  # before a look at each of its cells
+        raise UserError(f"{source}: {len(rows)} x {widest} cells; at most {most} x {most}")
     marks = LISTED if top[:1] and top[0] in (LISTED.wall, *LISTED.free) else DRAWN
     known = {marks.wall, *marks.free}
     for number, row in rows:
-        for column, char in enumerate(row, 1):
-            if char not in known:
-                raise UserError(f"{source}:{number}: column {column} is {char!r}; use {marks}")
+        if strange := set(row) - known:
+            column = min(map(row.index, strange))
+            raise UserError(f"{source}:{number}: column {column + 1} is {row[column]!r}; use {marks}")
         if len(row) != len(top):
             hint = f"line {first} has {len(top)}; make all lines equal"
             raise UserError(f"{source}:{number}: {len(row)} cells, but {hint}")
-    walls = np.array([[char == marks.wall for char in row] for _, row in rows])
+    drawn = "".join(row for _, row in rows).encode("ascii")
+    walls = np.frombuffer(drawn, np.uint8).reshape(len(rows), len(top)) == ord(marks.wall)
     _check_closed(walls, marks, source, lambda row, column: f"{source}:{rows[row][0]}: column {column + 1}")
     return walls[::-1]
 
@@ -374,12 +416,26 @@ def _neighbourhood(reach: int) -> Int[Array, "n 2"]:
 
 
 def clearance(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
-    """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall."""
+    """Distance [m] from a point to the nearest wall, exact up to one cell, then one cell; 0 inside a wall.
+
+    With ``boxes`` it goes on from one cell: there it is at most 1.5 cells too small, however far the wall is.
+    """
     cells = cell_of(maze, point)[None] + _neighbourhood(1)
     low = cells[:, ::-1] * maze.cell_m
     outside = jnp.maximum(jnp.maximum(low - point[None], point[None] - low - maze.cell_m), 0.0)
     distance = jnp.sqrt(jnp.sum(outside**2, -1))
-    return jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
+    near = jnp.min(jnp.where(is_wall(maze, cells), distance, maze.cell_m))
+    return near if maze.boxes is None else jnp.maximum(near, _room(maze, point))
+
+
+def _room(maze: Maze, point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Distance [m] from a point to the nearest wall of a maze with ``boxes``, or up to 1.5 cells less."""
+    assert maze.boxes is not None
+    row, column = (cell := cell_of(maze, point))
+    height, width = maze.shape
+    room = maze.boxes.room_m[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+    beside = jnp.linalg.norm((cell[::-1] + 0.5) * maze.cell_m - point)
+    return jnp.where(is_wall(maze, cell), 0.0, jnp.maximum(room - beside, 0.0))
 
 
 def segment_free(
@@ -387,9 +443,18 @@ def segment_free(
 ) -> Bool[Array, ""]:
     """Whether a disc of ``radius`` [m] swept from ``a`` to ``b`` touches no wall (exact, not sampled).
 
+    With ``boxes`` and a ``reach`` above ``EXACT_REACH`` it is free for certain where this says so; and a way that is
+    two cells wider at each side is always found free.
+
     Args:
         reach: cells looked at on each side of the segment's midpoint: ``segment_reach(max_length, ...)``.
     """
+    if (
+        maze.boxes is not None and reach > EXACT_REACH
+    ):  # points half a cell apart or less: between two, clearance changes by a quarter at most
+        points = a + jnp.linspace(0.0, 1.0, 4 * reach + 1)[:, None] * (b - a)
+        room = jax.vmap(_room, (None, 0))(maze, points)
+        return jnp.min(room) - jnp.linalg.norm(b - a) / (8 * reach) >= jnp.maximum(radius, 1e-6)
     # Each coordinate by itself: on CPU, XLA then needs a sixth of the time.
     middle, offset = cell_of(maze, (a + b) / 2), _neighbourhood(reach)
     row, column = (middle[i] + offset[:, i] for i in (0, 1))
@@ -453,7 +518,8 @@ def sample_free(
     """A random point with clearance ``radius`` [m], and the index of its cell in ``maze.free_cells``.
 
     The cell is uniform over the free ones, or over the region of ``free_cells[index]`` if that is given; the point is
-    uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are.
+    uniform over the cell less the robot's radius at each side, which keeps it clear whatever the neighbours are. With
+    ``boxes`` it is uniform over a square around the cell's centre, as large as the walls leave.
     """
     return _place(jax.random.uniform(key, (3,), jnp.float32), maze, radius, index)
 
@@ -471,5 +537,9 @@ def _place(
     """``sample_free`` from three numbers in [0, 1)."""
     low, high = (0, maze.n_free) if index is None else (maze.region_lo[index], maze.region_hi[index])
     chosen = jnp.minimum(low + (chance[0] * (high - low)).astype(jnp.int32), high - 1)
-    slack = maze.cell_m / 2 - radius - 1e-3
+    if maze.boxes is None:
+        slack = maze.cell_m / 2 - radius - 1e-3
+    else:  # the corners of the square, too, are clear of walls
+        room = maze.boxes.room_m.ravel()[maze.free_cells[chosen]]
+        slack = jnp.clip((room - radius) / np.sqrt(2.0) - 1e-3, 0.0, maze.cell_m / 2)
     return cell_centre(maze, maze.free_cells[chosen]) + (2.0 * chance[1:] - 1.0) * slack, chosen

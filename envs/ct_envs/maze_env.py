@@ -160,15 +160,16 @@ class MazeEnv(Env):
                 any more, and ``done`` stays 1.
             horizon: control steps of an episode; the default is the robot's horizon.
             reset_velocity_mps: standard deviation of the speed after a reset; the default is the robot's.
-            cell_m: side of the maze's cells [m].
+            cell_m: side of the maze's cells [m]. For cells smaller than the robot's reach, also give a ``maze`` of
+                ``ct_envs.fine``; resets then take mazes with the same number of boxes.
 
         Raises:
             UserError: unknown robot or engine, cells too small for the robot, or a maze with a different cell size.
         """
         if maze is not None:
-            _check_maze(maze, cell_m)
+            _check_maze(maze, cell_m, boxes_of(maze))
         self.robot = get_robot(robot, "maze") if isinstance(robot, str) else robot
-        self.engine = make_engine(engine, self.robot, cell_m=cell_m)
+        self.engine = make_engine(engine, self.robot, cell_m=cell_m, boxes=0 if maze is None else boxes_of(maze))
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
         self.horizon = horizon or self.robot.horizon
         self._with_horizon: dict[int, MazeEnv] = {self.horizon: self}  # shared with those that it holds
@@ -216,7 +217,7 @@ class MazeEnv(Env):
         maze = self.maze if maze is None else maze
         if maze is None:
             raise UserError("MazeEnv.reset needs a maze: give one to it or to MazeEnv(maze=...)")
-        _check_maze(maze, self.engine.cell_m)
+        _check_maze(maze, self.engine.cell_m, self.engine.boxes)
         if tasks is not None:
             check_tasks(tasks, maze)
         key, now = jax.random.split(rng)
@@ -343,14 +344,26 @@ class MazeEnv(Env):
         return self._observe(episode, stepped.replace(info=info | {"key": key}))
 
 
-def _check_maze(maze: Maze, cell_m: float) -> None:
-    """Raise UserError unless this is a single maze with cells of this size. A traced cell size is not checked."""
+def boxes_of(maze: Maze) -> int:
+    """How many boxes of any size a robot may have near it in a maze; 0 where its cells are large."""
+    return 0 if maze.boxes is None else maze.boxes.near.shape[-1]
+
+
+def _check_maze(maze: Maze, cell_m: float, boxes: int) -> None:
+    """Raise UserError unless this is a single maze with cells of this size and so many boxes.
+
+    A traced cell size is not checked.
+    """
     if jnp.ndim(maze.walls) != 2:
         raise UserError(
             f"the maze's walls have shape {jnp.shape(maze.walls)}; reset many mazes under jax.vmap(env.reset)"
         )
     if not _is_traced(maze.cell_m) and not np.allclose(maze.cell_m, cell_m):
         raise UserError(f"the maze's cells are not {cell_m} m wide; give MazeEnv the maze's own cell_m")
+    if boxes_of(maze) != boxes:
+        raise UserError(
+            f"the maze has {boxes_of(maze)} boxes near a robot, not {boxes}; give that maze to MazeEnv(maze=)"
+        )
 
 
 class FlatObservation(Wrapper):

@@ -29,6 +29,11 @@ class Robot:
     has_heading: bool = False  # the torso has a free joint, so the robot has a heading, which is random after a reset
     course: str = "maze"  # its world: a "maze" in MuJoCo, or a cluttered "room" in PyBullet
 
+    @property
+    def reach_m(self) -> float:
+        """How far from its centre it can touch something within a control step [m]."""
+        return self.touch_m + self.top_speed_mps * self.control_dt_s
+
 
 POINT = Robot(
     name="point",
