@@ -115,7 +115,7 @@ class Roadmap:
 
     @functools.cached_property
     def graph(self) -> nx.Graph:
-        """The roadmap as a networkx graph. Nodes have ``x_m`` and ``y_m``; edges have their length as ``weight`` [m]."""
+        """The roadmap as a networkx graph. Nodes have ``x_m`` and ``y_m``; edges have a length, ``weight`` [m]."""
         graph = nx.Graph()
         graph.add_nodes_from((i, {"x_m": x, "y_m": y}) for i, (x, y) in enumerate(self.points.tolist()))
         graph.add_weighted_edges_from(zip(*self.edges.T.tolist(), self.length.tolist(), strict=True))
