@@ -338,7 +338,7 @@ def test_rows_that_are_none_are_named(name, value, tiny_run, tmp_path, tiny_sett
             pipeline.results(tmp_path)
 
 
-@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "target": 3}, {"maze": 9}])
+@pytest.mark.parametrize("changes", [{"proprio": 3}, {"action": 3, "label": 3}, {"maze": 9}])
 def test_trajectories_of_another_run_are_refused(changes, toy_data, tiny_run, tiny_settings, tmp_path):
     """Of another robot, or of mazes that this run has not."""
     folder = copy(tiny_run, tmp_path)
