@@ -65,11 +65,11 @@ class Square:
     def sample_tasks(self, key, config, prm, *, first=0, offset=0):
         run_key, ends_key = jax.random.split(jax.random.fold_in(key, first))
         ends = np.asarray(jax.random.uniform(ends_key, (2, config.envs, 2), jnp.float32, 0.0, self.side_m))
-        return Tasks(*ends, np.zeros(config.envs, int), run_key)
+        return Tasks(ends[0], ends[1], np.zeros(config.envs, int), run_key)
 
     def draw_pairs(self, seed, n):
         ends = np.random.default_rng(seed).uniform(0.0, self.side_m, (2, n, 2)).astype(np.float32)
-        return Pairs(*ends, np.linalg.norm(ends[0] - ends[1], axis=-1), seed)
+        return Pairs(ends[0], ends[1], np.linalg.norm(ends[0] - ends[1], axis=-1), seed)
 
     def tasks_of(self, pairs, prm):
         if np.max(pairs.ends) > self.side_m:
@@ -255,7 +255,7 @@ def test_a_new_guide_leads_in_every_world(make, push):
     for i, length in enumerate(data.length):  # the planner knows no walls: these ways are the straight ones
         start, goal = data.position[i, 0], data.goal_world[i]
         along = (goal - start) / np.linalg.norm(goal - start)
-        off = (data.position[i, :length] - start) @ [-along[1], along[0]]
+        off = (data.position[i, :length] - start) @ np.array([-along[1], along[0]])
         assert np.abs(off).max() < 2.0
 
 
