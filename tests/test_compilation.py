@@ -27,10 +27,11 @@ FOLDER = "jax_compilation_cache_dir"
 def count(arguments, settings, home, file):
     """A command in a process of its own; writes down how many programs it asked for, and how many were there."""
     from ct_envs import robots
-    from ct_jax import cli, presets
+    from ct_jax import cli
+    from ct_jax.configs import point
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
-    presets.PRESETS["tiny"] = settings
+    point.PRESETS["tiny"] = settings
     os.environ["XDG_CACHE_HOME"] = str(home)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     seen = Counter()

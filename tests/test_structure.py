@@ -11,12 +11,12 @@ import ct_jax
 ROOT = Path(__file__).parents[1]
 # Stages of ct_jax. Each may import those above it, and its own parts; a new module takes its place here.
 ORDER = [
-    *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "progress"],
-    *["prm", "rollout", "explorer", "controllers", "trajectories", "collect"],
+    *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "learner", "progress"],
+    *["prm", "rollout", "explorer", "controllers", "controller", "trajectories", "collect"],
     *["drive", "explorer_turtlebot3", "collect_turtlebot3"],
-    *["dense", "transformer", "value", "fit", "policy", "agent", "evaluate", "finetune"],
+    *["dense", "transformer", "heads", "value", "fit", "policy", "agent", "evaluate", "finetune"],
     *["evaluate_turtlebot3", "finetune_turtlebot3"],
-    *["baselines", "transfer", "settings", "presets", "model", "run"],
+    *["baselines", "transfer", "settings", "configs", "model", "run"],
     *["report", "mazes", "rooms", "pipeline", "cli"],
 ]
 USERS = {"experiments", "benchmarks", "tests"}  # of the packages: no package knows of them

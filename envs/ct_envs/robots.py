@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
+from typing import Literal
 
 from ct_envs.checked import shown
 from ct_envs.errors import UserError
@@ -12,7 +14,7 @@ class Robot:
     """What there is to know of a robot besides its MJCF model. SI units."""
 
     name: str
-    xml: str  # file under assets/
+    xml: str  # file under assets/, or the absolute path of one elsewhere
     radius_m: float  # of the smallest upright cylinder that the roadmap keeps clear of walls
     touch_m: float  # farthest any part reaches from the centre: the nearest walls are looked for within it
     top_speed_mps: float  # at most this fast, so that no wall is missed within a control step
@@ -25,9 +27,9 @@ class Robot:
     reset_joints_rad: float = 0.0  # joints begin within this of the standing pose
     upright_min: float | None = None  # cosine of the torso's tilt below which the robot has fallen
     height_min_m: float | None = None  # height of the torso below which the robot has fallen
-    controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
+    controller_reward: Literal["velocity", "distance"] = "velocity"  # (paper, sec. III-G)
     has_heading: bool = False  # its torso hangs on a free joint: it can turn, and begins looking anywhere
-    course: str = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
+    course: Literal["maze", "room"] = "maze"  # where it drives: a "maze" of MuJoCo, or a cluttered "room" of PyBullet
 
 
 POINT = Robot(
@@ -101,6 +103,17 @@ def get_robot(name: str, course: str | None = None) -> Robot:
     return ROBOTS[name]
 
 
+def register(robot: Robot) -> Robot:
+    """Make a robot of one's own known by its name, and return it. Raises UserError if another robot has that name."""
+    if ROBOTS.setdefault(robot.name, robot) != robot:
+        raise UserError(f"there is another robot named {shown(robot.name)}; give yours a name of its own")
+    return robot
+
+
 def model_xml(robot: Robot) -> str:
-    """Text of the robot's MJCF."""
-    return (resources.files("ct_envs") / "assets" / robot.xml).read_text("utf-8")
+    """Text of the robot's MJCF. Raises UserError if the file of a registered robot cannot be read."""
+    file = Path(str(resources.files("ct_envs"))) / "assets" / robot.xml  # an absolute path stays what it is
+    try:
+        return file.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as bad:
+        raise UserError(f"{file}: not the MJCF of robot '{robot.name}' ({bad})") from None
