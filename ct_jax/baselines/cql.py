@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.distribution import NormalTanhDistribution
 from flax import struct
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
@@ -116,7 +115,7 @@ class Cql:
         critics = jax.jit(self.critics.init)(critic_key, see, jnp.zeros((1, 1, self.action_size)))
         params = Learned(actor, critics, jnp.log(jnp.asarray(self.config.temperature, jnp.float32)))
         fresh = self.replace(
-            params=params, target=critics, optimizer=self.descent.init(params), key=key, step=jnp.zeros((), jnp.int32)
+            params=params, target=critics, optimizer=self._adam.init(params), key=key, step=jnp.zeros((), jnp.int32)
         )
         return place(jax.tree.map(jnp.array, fresh), replicated(self.mesh))
 
@@ -130,10 +129,14 @@ class Cql:
         window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
         batch = transitions(window, self.robot.goal_tolerance_m)
         gradient, info = jax.grad(self.loss, has_aux=True)(self.params, batch, noise)
-        change, optimizer = self.descent.update(gradient, self.optimizer, self.params)
+        change, optimizer = self._adam.update(gradient, self.optimizer, self.params)
         params: Any = optax.apply_updates(self.params, change)
         target = optax.incremental_update(params.critics, self.target, self.config.target_rate)
         return self.replace(params=params, target=target, optimizer=optimizer, step=self.step + 1), info
+
+    @property
+    def _adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.config.learning_rate)
 
     @property
     def mesh(self) -> Mesh:
@@ -149,16 +152,6 @@ class Cql:
     def critics(self) -> Critics:
         """The critics' network."""
         return Critics(self.config.width, self.config.frame)
-
-    @property
-    def distribution(self) -> NormalTanhDistribution:
-        """Of the policy's actions."""
-        return tanh_gaussian(self.action_size)
-
-    @property
-    def descent(self) -> optax.GradientTransformation:
-        """Adam."""
-        return optax.adam(self.config.learning_rate)
 
     @property
     def policy(self) -> ActorPolicy:
@@ -216,17 +209,18 @@ class Cql:
         value = self.critics.apply(critics, batch.now, action).min(-1)[:, 0]  # pyright: ignore
         if self.config.imitation:
             # The inverse of tanh is infinite at the bounds, so clip the actions.
-            done = self.distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
-            value = jnp.where(update < self.config.imitation, self.distribution.log_prob(logits, done), value)
+            distribution = tanh_gaussian(self.action_size)
+            done = distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
+            value = jnp.where(update < self.config.imitation, distribution.log_prob(logits, done), value)
         return temperature * log_density[:, 0] - value, -log_density[:, 0]
 
     def _draw(
         self, key: jax.Array, logits: Float[Array, "B 2A"], n: int
     ) -> tuple[Float[Array, "B n A"], Float[Array, "B n"]]:
         """n actions of the policy, and their log-densities."""
-        logits = jnp.repeat(logits[:, None], n, 1)
-        raw = self.distribution.sample_no_postprocessing(logits, key)
-        return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
+        distribution, logits = tanh_gaussian(self.action_size), jnp.repeat(logits[:, None], n, 1)
+        raw = distribution.sample_no_postprocessing(logits, key)
+        return distribution.postprocess(raw), distribution.log_prob(logits, raw)
 
 
 def train_cql(

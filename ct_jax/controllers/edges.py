@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from ct_envs import MazeEnv, Tasks, UserError
 from ct_envs.checked import Above, Checked, Share, Within
+from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
 from ct_jax.controllers.augment import AugmentConfig, check_frame, controller_inputs, input_size, mirrored
 from ct_jax.controllers.reward import Ramp, Reward, RewardConfig, check_ramp
@@ -90,6 +91,8 @@ class EdgeTask:
 
     def __post_init__(self) -> None:
         check_frame(self.augment.frame, self.env.robot)
+        if self.augment.mirror:
+            symmetries(self.env.robot)  # raises UserError if it has no known ones
 
     @property
     def reward(self) -> Reward:

@@ -135,17 +135,17 @@ class Sac:
             batch: observations are the networks' inputs.
             keys: two, of policy and critics.
         """
-        descend = {name: self._descent(loss) for name, loss in self._losses().items()}
+        cool, criticise, act = self._descents()
         # The losses of temperature and policy use the same key, so the same actions, which are computed once.
-        (_, alpha_info), log_alpha, alpha_optimizer = descend["alpha"](
+        (_, alpha_info), log_alpha, alpha_optimizer = cool(
             self.log_alpha, self.policy, self.normalizer, batch, keys[0], optimizer_state=self.alpha_optimizer
         )
         alpha = jnp.exp(self.log_alpha)
-        (_, critic_info), critic, critic_optimizer = descend["critic"](
+        (_, critic_info), critic, critic_optimizer = criticise(
             self.critic, self.policy, self.normalizer, self.target_critic, alpha, batch, keys[1],
             optimizer_state=self.critic_optimizer,
         )  # fmt: skip
-        (_, actor_info), policy, policy_optimizer = descend["actor"](
+        (_, actor_info), policy, policy_optimizer = act(
             self.policy, self.normalizer, self.critic, alpha, batch, keys[0], optimizer_state=self.policy_optimizer
         )
         average = optax.incremental_update(policy, self.average, 1.0 - self.config.average)
@@ -159,27 +159,20 @@ class Sac:
     @property
     def _optimizer(self) -> optax.GradientTransformation:
         config = self.config
-        updates = config.iterations * config.updates
-        return optax.adam(
-            optax.linear_schedule(config.learning_rate, config.final_rate * config.learning_rate, updates)
-        )
+        first, last = config.learning_rate, config.final_rate * config.learning_rate
+        return optax.adam(optax.linear_schedule(first, last, config.iterations * config.updates))
 
-    def _losses(self) -> dict[str, Callable[..., tuple[jax.Array, Info]]]:
-        """brax's losses, each with what it reports."""
-        config = self.config
-        alpha, critic, actor = sac_losses.make_losses(
-            self.networks, reward_scaling=config.reward_scale, discounting=config.discount, action_size=self.action_size
-        )
+    def _descents(self) -> list[Callable[..., Any]]:
+        """Steps of gradient descent on brax's losses of temperature, critics and policy, each in its first argument."""
+        losses = sac_losses.make_losses(self.networks, self.config.reward_scale, self.config.discount, self.action_size)
+        named = zip(("alpha_loss", "critic_loss", "actor_loss"), losses, strict=True)
+        descend = functools.partial(gradients.gradient_update_fn, pmap_axis_name=None, has_aux=True)
+        return [descend(_with_info(name, loss), self._optimizer) for name, loss in named]
 
-        def with_info(name: str, loss: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, Info]]:
-            def informed(*arguments: Any) -> tuple[jax.Array, Info]:
-                value = loss(*arguments)
-                return value, {f"{name}_loss": value}
 
-            return informed
+def _with_info(name: str, loss: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, Info]]:
+    def informed(*arguments: Any) -> tuple[jax.Array, Info]:
+        value = loss(*arguments)
+        return value, {name: value}
 
-        return {name: with_info(name, loss) for name, loss in (("alpha", alpha), ("critic", critic), ("actor", actor))}
-
-    def _descent(self, loss: Callable[..., tuple[jax.Array, Info]]) -> Callable[..., Any]:
-        """A step of gradient descent on a loss in its first argument."""
-        return gradients.gradient_update_fn(loss, self._optimizer, pmap_axis_name=None, has_aux=True)
+    return informed
