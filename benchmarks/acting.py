@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from _harness import Contestant, Options, Results, command_line, has_peer
 
-from ct_jax.presets import get_preset
+from ct_jax.configs import get_preset
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache, sample_inputs
 
 PROPRIO, ACTION = 27, 8  # the ant's

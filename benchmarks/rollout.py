@@ -26,8 +26,8 @@ from mujoco.batch import Batch
 
 from ct_envs import MazeEnv, load_maze
 from ct_jax.collect import collect
+from ct_jax.configs import get_preset
 from ct_jax.model import load_controller
-from ct_jax.presets import get_preset
 from ct_jax.run import cores
 from ct_jax.worlds.mazes import MazeWorld
 

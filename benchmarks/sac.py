@@ -23,7 +23,10 @@ from flax import struct
 
 from ct_envs import MazeEnv, Tasks, load_maze
 from ct_envs.maze import Maze
-from ct_jax.controllers.sac import Sac, SacConfig, SacController, edge_success, split_edges
+from ct_jax.controller import ControllerConfig, SacController, edge_success, learned, start_training
+from ct_jax.controllers.edges import split_edges
+from ct_jax.controllers.off_policy import OffPolicy
+from ct_jax.controllers.sac import SacConfig
 from ct_jax.prm import build_roadmap
 
 PEER = "Stable-Baselines3"
@@ -63,7 +66,7 @@ def main(options: SacOptions) -> None:
 
 def count(ours: "Learner", flop: float, peer: bool, asked: float, options: SacOptions, results: Results) -> None:
     """The rows of a robot's updates per second; ``flop`` is the number of operations per update."""
-    config = ours.sac.config
+    config = ours.state.config
     iterations = max(1, options.updates // config.updates)
     work = float(iterations * config.updates)
     others = {PRODUCTS: products(config, flop, work)}
@@ -76,7 +79,7 @@ def count(ours: "Learner", flop: float, peer: bool, asked: float, options: SacOp
 
 def update_flop(learner: "Learner") -> float:
     """Floating-point operations of an update, as counted by XLA, for a learner with one update per iteration."""
-    one = jax.jit(learner.sac._updates).lower(learner.state).compile()
+    one = jax.jit(OffPolicy.learn).lower(learner.state).compile()
     return float(one.cost_analysis()["flops"])  # pyright: ignore
 
 
@@ -118,29 +121,27 @@ def time_to(options: SacOptions, train: Callable[[int], Any], success: Callable[
 class Learner:
     """Our learner, on the edges of a roadmap of ``antmaze-large``."""
 
-    def __init__(self, robot: str, config: SacConfig):
-        self.maze = load_maze("antmaze-large")
-        options = {"horizon": config.episode_steps, "maps": False}
-        self.env = MazeEnv(robot, engine="auto", reset_velocity_mps=config.reset_velocity_mps, **options)
+    def __init__(self, robot: str, sac: SacConfig):
+        self.maze, self._config = load_maze("antmaze-large"), ControllerConfig(sac)
+        edges = self._config.edges
+        options = {"horizon": edges.episode_steps, "maps": False}
+        self.env = MazeEnv(robot, engine="auto", reset_velocity_mps=edges.reset_velocity_mps, **options)
         self._still = MazeEnv(robot, engine="auto", auto_reset=False, **options)
         roadmap = build_roadmap(jax.random.key(0), self.maze, radius_m=self.env.robot.radius_m)
-        self.tasks, self._held_out = split_edges(roadmap, config.held_out, 0)
-        self.sac = Sac(self.env, config)
-        self.state, _ = self.sac.train(self.sac.create(jax.random.key(0), self.maze, self.tasks), config.warmup)
-        self.sac.train(self.state, CHUNK)  # compiles
+        self.tasks, self._held_out = split_edges(roadmap, edges.held_out, 0)
+        begun = start_training(jax.random.key(0), self.env, self.maze, self.tasks, self._config)
+        self.state, _ = begun.train(sac.warmup)
+        self.state.train(CHUNK)  # compiles
 
     def train(self, iterations: int) -> Any:
         """Train for a number of iterations."""
-        self.state, report = self.sac.train(self.state, iterations)
+        self.state, report = self.state.train(iterations)
         return jax.block_until_ready(report)
 
     @property
     def controller(self) -> SacController:
         """The current controller."""
-        config, state = self.sac.config, self.state
-        return SacController(
-            state.normalizer, state.average, self.env.action_size, config.hidden, config.frame, config.action_scale
-        )
+        return learned(self.state, self._config)
 
     def success(self, controller: Any) -> float:
         """Success rate of a controller on the held-out edges."""
@@ -173,9 +174,9 @@ class PeerLearner:
         from stable_baselines3 import SAC  # pyright: ignore[reportMissingImports]
         from stable_baselines3.common.vec_env import VecNormalize  # pyright: ignore[reportMissingImports]
 
-        config, size = ours.sac.config, ours.env.action_size
+        config, size = ours.state.config, ours.env.action_size
         self._envs, self._action_size = config.envs, size
-        self._normal = VecNormalize(vec_env(ours.sac, ours.maze, ours.tasks), norm_reward=False)
+        self._normal = VecNormalize(vec_env(ours.state, ours.maze, ours.tasks), norm_reward=False)
         torch.manual_seed(0)
         self._sac = SAC(
             "MlpPolicy", self._normal, learning_rate=config.learning_rate, buffer_size=config.replay,
@@ -202,30 +203,30 @@ class PeerLearner:
         return PeerController(jnp.asarray(seen.mean, jnp.float32), deviation, layers, self._action_size)  # pyright: ignore
 
 
-def vec_env(sac: Sac, maze: Maze, tasks: Tasks) -> Any:
+def vec_env(training: OffPolicy, maze: Maze, tasks: Tasks) -> Any:
     """Our learner's environments, with its observations and rewards, as a ``VecEnv``."""
     from gymnasium.spaces import Box  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
-    env, n = sac.env, sac.config.envs
+    task, config = training.task, training.config
+    env, n = task.env, config.envs
 
     @jax.jit
     def step(state: Any, action: jax.Array) -> tuple[Any, ...]:
-        after = jax.vmap(env.step)(state, sac.config.action_scale * action)
-        return after, sac._observe(after), sac._reward(state, action, after), after.done
+        after = jax.vmap(env.step)(state, config.action_scale * action)
+        return after, task.observe(after), task.reward(state, action, after), after.done
 
     class Environments(VecEnv):
         """All environments; one compiled call steps them."""
 
         def __init__(self) -> None:
-            size = env.proprio_size + sac.kept
-            seen = Box(-np.inf, np.inf, (size,), np.float32)
+            seen = Box(-np.inf, np.inf, (task.observation_size,), np.float32)
             super().__init__(n, seen, Box(-1.0, 1.0, (env.action_size,), np.float32))
             reset = jax.vmap(env.reset, in_axes=(0, None, None))
             self._state = jax.jit(reset)(jax.random.split(jax.random.key(0), n), maze, tasks)
 
         def reset(self) -> np.ndarray:
-            return np.asarray(sac._observe(self._state))
+            return np.asarray(task.observe(self._state))
 
         def step_async(self, actions: np.ndarray) -> None:
             before = self._observed if hasattr(self, "_observed") else self.reset()

@@ -25,12 +25,14 @@ from transformer import trajectories
 from ct_envs import UserError, load_maze, stack_mazes
 from ct_envs.robots import get_robot
 from ct_jax.cli import guarded, leave
+from ct_jax.configs import get_preset
 from ct_jax.devices import replicated, sharded
 from ct_jax.files import prepare_outputs, write_text
 from ct_jax.fit import Fit, transformer_loss
+from ct_jax.heads import make_head
+from ct_jax.learner import updates_on
 from ct_jax.model import sizes
-from ct_jax.presets import get_preset
-from ct_jax.settings import Settings
+from ct_jax.settings import Settings, controller_config
 from ct_jax.terminal import printable
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
@@ -139,7 +141,8 @@ def measured(options: ScaleOptions, samples: int) -> Measured:
 
 def weigh(robot: str, settings: Settings) -> Sizes:
     """Sizes of the arrays; and memory and messages of an update, compiled by XLA for all devices."""
-    model = ControlTransformer(settings.model, sizes(robot)[1], settings.sac)
+    size = sizes(robot)[1]
+    model = ControlTransformer(settings.model, size, make_head(settings.model, size, controller_config(settings)))
     learner = Fit(transformer_loss(model), settings.fit, settings.model.map_cell_m, get_robot(robot))
     steps = -(-settings.collect.horizon // 256) * 256  # padded as in ``spread``
     data = jax.eval_shape(lambda: trajectories(robot, SMALL, steps))
@@ -152,7 +155,9 @@ def weigh(robot: str, settings: Settings) -> Sizes:
     everywhere, split = replicated(learner.mesh), sharded(learner.mesh)
     placed = put(data, split).replace(length=put(data.length, everywhere))
     mazes = put(stack_mazes([load_maze("antmaze-large")]), everywhere)
-    program = learner.train.lower(put(state, everywhere), placed, put(rtg, split), mazes, 1).compile()
+    program = (
+        updates_on(learner.mesh).lower(put(state, everywhere), placed, put(rtg, split), mazes, updates=1).compile()
+    )
     memory: Any = program.memory_analysis()
     weight = lambda tree: sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))  # noqa: E731
     return Sizes(

@@ -20,9 +20,12 @@ from _harness import Contestant, Options, Results, command_line, has_peer
 
 from ct_envs import load_maze, stack_mazes
 from ct_envs.robots import get_robot
+from ct_jax.configs import get_preset
 from ct_jax.fit import Fit, init_params, transformer_loss
+from ct_jax.heads import make_head
+from ct_jax.learner import train
 from ct_jax.model import sizes
-from ct_jax.presets import get_preset
+from ct_jax.settings import controller_config
 from ct_jax.trajectories import Trajectories, Window, sample_windows
 from ct_jax.transformer import ControlTransformer
 
@@ -65,21 +68,22 @@ def measure(robot: str, dtype: str, attention: str, torch: bool, options: Transf
     """The rows of one model."""
     settings = get_preset(options.preset, robot)
     fit, map_cell_m, spec = settings.fit, settings.model.map_cell_m, get_robot(robot)
-    size, sac = sizes(robot)[1], settings.sac
-    model = ControlTransformer(settings.model, size, sac, dtype=jnp.dtype(dtype), attention=attention)
+    size = sizes(robot)[1]
+    head = make_head(settings.model, size, controller_config(settings))
+    model = ControlTransformer(settings.model, size, head, dtype=jnp.dtype(dtype), attention=attention)
     data = trajectories(robot)
     mazes = stack_mazes([load_maze("antmaze-large")]) if data.map_bits is None else None
     learner = Fit(transformer_loss(model), fit, map_cell_m, spec)
-    state = learner.create(jax.random.key(0), init_params(jax.random.key(1), model, data))
+    learner = learner.create(jax.random.key(0), init_params(jax.random.key(1), model, data))
     draw = jax.jit(lambda key: sample_windows(
         key, data, data.rtg, mazes, batch=fit.batch, steps=fit.steps, map_cell_m=map_cell_m))  # fmt: skip
     window = draw(jax.random.key(2))
     # Count the operations with plain attention, because XLA does not count those inside cuDNN.
-    plain = ControlTransformer(settings.model, size, sac)
-    step_flop = flop(plain, state.params, window)
+    plain = ControlTransformer(settings.model, size, head)
+    step_flop = flop(plain, learner.params, window)
     accelerator = jax.default_backend() != "cpu"
     updates = max(1, int((100 if accelerator else 1) * options.gflop * 1e9 / step_flop))
-    ours = Contestant(lambda: learner.train(state, data, data.rtg, mazes, updates), updates)
+    ours = Contestant(lambda: train(learner, updates, data, data.rtg, mazes), updates)
     product = f"{dtype} matrix product"
     others = {product: matrix_product(options.side * (4 if accelerator else 1), dtype, step_flop)}
     if torch:

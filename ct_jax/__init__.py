@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from ct_jax.agent import Agent
     from ct_jax.collect import CollectConfig
     from ct_jax.collect import collect as collect_trajectories
+    from ct_jax.configs import get_preset
+    from ct_jax.controllers.augment import AugmentConfig
+    from ct_jax.controllers.edges import EdgeConfig
     from ct_jax.controllers.sac import SacConfig
     from ct_jax.evaluate import Episodes
     from ct_jax.evaluate import evaluate as evaluate_pairs
@@ -20,7 +23,6 @@ if TYPE_CHECKING:
     from ct_jax.model import load_model as load
     from ct_jax.pipeline import evaluate_model, train
     from ct_jax.policy import TransformerPolicy
-    from ct_jax.presets import get_preset
     from ct_jax.prm import PrmConfig
     from ct_jax.run import Run
     from ct_jax.settings import Settings
@@ -32,23 +34,25 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "Action", "Agent", "CollectConfig", "ControlTransformer", "Controller", "Episodes", "FitConfig", "Frame", "Guide",
-    "MazeWorld", "ModelConfig", "Observation", "Policy", "PrmConfig", "RecoverConfig", "RoomWorld", "Run", "SacConfig",
-    "Settings", "Trajectories", "TransformerPolicy", "UserError", "ValueConfig", "World", "collect_trajectories",
-    "evaluate_model", "evaluate_pairs", "get_preset", "load", "recover", "train",
+    "Action", "Agent", "AugmentConfig", "CollectConfig", "ControlTransformer", "Controller", "EdgeConfig", "Episodes",
+    "FitConfig", "Frame", "Guide", "MazeWorld", "ModelConfig", "Observation", "Policy", "PrmConfig", "RecoverConfig",
+    "RoomWorld", "Run", "SacConfig", "Settings", "Trajectories", "TransformerPolicy", "UserError", "ValueConfig",
+    "World", "collect_trajectories", "evaluate_model", "evaluate_pairs", "get_preset", "load", "recover", "train",
 ]  # fmt: skip
 
 _NAMES = {
     "ct_envs.errors": ("UserError",),
     "ct_jax.agent": ("Agent",),
     "ct_jax.collect": ("CollectConfig",),
+    "ct_jax.controllers.augment": ("AugmentConfig",),
+    "ct_jax.controllers.edges": ("EdgeConfig",),
     "ct_jax.controllers.sac": ("SacConfig",),
     "ct_jax.evaluate": ("Episodes",),
     "ct_jax.finetune": ("RecoverConfig", "recover"),
     "ct_jax.fit": ("FitConfig", "ValueConfig"),
     "ct_jax.pipeline": ("evaluate_model", "train"),
     "ct_jax.policy": ("TransformerPolicy",),
-    "ct_jax.presets": ("get_preset",),
+    "ct_jax.configs": ("get_preset",),
     "ct_jax.settings": ("Settings",),
     "ct_jax.prm": ("PrmConfig",),
     "ct_jax.run": ("Run",),

@@ -361,7 +361,7 @@ def _print_settings(command: Any) -> None:
     if not isinstance(command, Train):
         raise UserError(f"{ALL_SETTINGS} is for: {PROGRAM} train ROBOT {ALL_SETTINGS}")
     import ct_envs.quiet  # noqa: F401
-    from ct_jax.presets import get_preset
+    from ct_jax.configs import get_preset
 
     with contextlib.suppress(SystemExit):
         _changed(get_preset(command.preset, command.robot), command, "--help")
@@ -430,18 +430,18 @@ def _import_jax() -> None:
 
 
 def _train(command: Train) -> None:
-    from ct_envs.robots import get_robot
+    from ct_jax.configs import find_robot
 
-    if get_robot(command.robot).course == "room":
-        _check_in_rooms(command)  # before the slow imports
+    if find_robot(command.robot).course == "room":
+        _check_in_rooms(command)  # before what takes seconds
     _check_processes(command.among)
     check_stdout()
     prepare_jax(command.among)
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
+    from ct_jax.configs import get_preset
     from ct_jax.devices import is_first
     from ct_jax.model import load_controller
-    from ct_jax.presets import get_preset
     from ct_jax.run import Run, default_mazes, load_mazes
 
     seen, unseen = default_mazes(command.robot)

@@ -20,10 +20,11 @@ from jaxtyping import Array, Float
 
 from ct_envs import Robot, UserError
 from ct_envs.checked import Above, Checked, Count, Within
-from ct_envs.frames import symmetries, turns
+from ct_envs.frames import Symmetries, symmetries, turns
 from ct_envs.maze import Maze
-from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.checkpoint import Checkpoints
 from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
+from ct_jax.learner import Info, learn
 from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
 from ct_jax.transformer import RETURN_DIVISOR, ControlTransformer, Modes, sample_inputs
 from ct_jax.value import ValueNetwork
@@ -65,76 +66,75 @@ class ValueConfig(Checked):
     width: Annotated[int, Within(1, 16_384)] = 128
 
 
+Loss = Callable[[Any, Window, jax.Array], tuple[jax.Array, Info]]
+
+
 @struct.dataclass
-class FitState:
-    """The complete state of training, from which it can continue."""
-
-    params: Any
-    optimizer: Any
-    key: jax.Array
-    update: jax.Array
-
-
-Loss = Callable[[Any, Window, jax.Array], jax.Array]
-
-
 class Fit:
-    """A learner by gradient descent on windows of trajectories: ``create`` and ``train``, both pure."""
+    """A learner by gradient descent on windows of trajectories: its settings, and after ``create`` its arrays."""
 
-    def __init__(self, loss: Loss, config: FitConfig, map_cell_m: float, robot: Robot, *, stride: int = 1):
-        """
-        Args:
-            stride: control steps from one step of a window to the next.
-        """
-        self.loss, self.config, self.map_cell_m, self.stride = loss, config, map_cell_m, stride
-        self._symmetries = symmetries(robot) if config.mirror else None
-        if self._symmetries is not None and config.turns:
-            self._symmetries = turns(self._symmetries)
+    loss: Loss = struct.field(pytree_node=False)
+    config: FitConfig = struct.field(pytree_node=False)
+    map_cell_m: float = struct.field(pytree_node=False)
+    robot: Robot = struct.field(pytree_node=False)
+    stride: int = struct.field(pytree_node=False, default=1)  # control steps from one step of a window to the next
+    params: Any = None
+    optimizer: Any = None
+    key: Any = None
+    step: Any = None  # updates so far
+
+    def create(self, key: jax.Array, params: Any) -> "Fit":
+        """The learner before training, replicated over the devices."""
+        fresh = self.replace(params=params, optimizer=self.descent.init(params), key=key, step=jnp.zeros((), jnp.int32))
+        return place(jax.tree.map(jnp.array, fresh), replicated(self.mesh))
+
+    def update(self, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze | None) -> tuple["Fit", Info]:
+        """One update on a batch of windows."""
+        draw, drop = jax.random.split(jax.random.fold_in(self.key, self.step))
+        window = sample_windows(
+            draw,
+            data,
+            rtg,
+            mazes,
+            batch=self.config.batch,
+            steps=self.config.steps,
+            map_cell_m=self.map_cell_m,
+            symmetries=self._symmetries(),
+            shift_timestep=self.config.shift_timestep,
+            stride=self.stride,
+        )
+        window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
+        gradient, info = jax.grad(self.loss, has_aux=True)(self.params, window, drop)
+        change, optimizer = self.descent.update(gradient, self.optimizer, self.params)
+        params = optax.apply_updates(self.params, change)
+        return self.replace(params=params, optimizer=optimizer, step=self.step + 1), info
+
+    @property
+    def mesh(self) -> Mesh:
+        """The devices that share a batch."""
+        return data_mesh(self.config.batch)
+
+    @property
+    def descent(self) -> optax.GradientTransformation:
+        """AdamW with clipped gradients and a rate that warms up."""
+        config = self.config
         if config.decay:
             rate = optax.warmup_cosine_decay_schedule(
                 0.0, config.learning_rate, config.warmup, max(config.updates, config.warmup + 1)
             )
         else:
             rate = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
-        self.optimizer = optax.chain(
+        return optax.chain(
             optax.clip_by_global_norm(config.clip),
             optax.adamw(rate, weight_decay=config.weight_decay, mask=_matrices),
         )
-        self.mesh = data_mesh(config.batch)
-        self.train = jax.jit(self._train, static_argnames="updates", out_shardings=replicated(self.mesh))
 
-    def create(self, key: jax.Array, params: Any) -> FitState:
-        """The state before training, replicated over the devices."""
-        state = FitState(params, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
-        return place(jax.tree.map(jnp.array, state), replicated(self.mesh))
-
-    def _train(
-        self, state: FitState, data: Trajectories, rtg: Float[Array, "N T"], mazes: Maze | None, updates: int
-    ) -> tuple[FitState, jax.Array]:
-        """Run ``updates`` updates (static); returns the state and the mean loss."""
-
-        def update(state: FitState, _) -> tuple[FitState, jax.Array]:
-            draw, drop = jax.random.split(jax.random.fold_in(state.key, state.update))
-            window = sample_windows(
-                draw,
-                data,
-                rtg,
-                mazes,
-                batch=self.config.batch,
-                steps=self.config.steps,
-                map_cell_m=self.map_cell_m,
-                symmetries=self._symmetries,
-                shift_timestep=self.config.shift_timestep,
-                stride=self.stride,
-            )
-            window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
-            loss, gradient = jax.value_and_grad(self.loss)(state.params, window, drop)
-            change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
-            params = optax.apply_updates(state.params, change)
-            return FitState(params, optimizer, state.key, state.update + 1), loss
-
-        state, losses = jax.lax.scan(update, state, length=updates)
-        return state, losses.mean()
+    def _symmetries(self) -> Symmetries | None:
+        """Those by which windows are transformed. Raises UserError if the robot has no known ones."""
+        if not self.config.mirror:
+            return None
+        found = symmetries(self.robot)
+        return turns(found) if self.config.turns else found
 
 
 def _matrices(params: Any) -> Any:
@@ -150,7 +150,7 @@ def transformer_loss(model: ControlTransformer) -> Loss:
     with one mode it equals the squared error.
     """
 
-    def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
+    def loss(params: Any, window: Window, key: jax.Array) -> tuple[jax.Array, Info]:
         predicted: Modes = model.apply(
             params, window.map, window.proprio, window.goal_relative, window.action, window.rtg, window.timestep,
             window.valid, deterministic=False, rngs={"dropout": key}, method="propose",
@@ -158,7 +158,8 @@ def transformer_loss(model: ControlTransformer) -> Loss:
         error = jnp.mean((predicted.action - window.label[..., None, :]) ** 2, -1)
         likelihood = jax.nn.log_softmax(predicted.logit) - error / MODE_SPREAD
         error = -MODE_SPREAD * jax.nn.logsumexp(likelihood, -1)
-        return jnp.sum(error * window.label_mask) / jnp.maximum(jnp.sum(window.label_mask), 1.0)
+        mean = jnp.sum(error * window.label_mask) / jnp.maximum(jnp.sum(window.label_mask), 1.0)
+        return mean, {"loss": mean}
 
     return loss
 
@@ -166,11 +167,12 @@ def transformer_loss(model: ControlTransformer) -> Loss:
 def value_loss(model: ValueNetwork) -> Loss:
     """Mean squared error of the predicted return-to-go, in units of ``RETURN_DIVISOR`` (paper, sec. III-D)."""
 
-    def loss(params: Any, window: Window, key: jax.Array) -> jax.Array:
+    def loss(params: Any, window: Window, key: jax.Array) -> tuple[jax.Array, Info]:
         del key
         value = model.apply(params, window.map, window.proprio, window.goal_relative)
         error = ((value - window.rtg) / RETURN_DIVISOR) ** 2  # pyright: ignore
-        return jnp.sum(error * window.valid) / jnp.maximum(jnp.sum(window.valid), 1.0)
+        mean = jnp.sum(error * window.valid) / jnp.maximum(jnp.sum(window.valid), 1.0)
+        return mean, {"loss": mean}
 
     return loss
 
@@ -243,11 +245,11 @@ def fit(
         on_progress: called with (updates done, mean loss since the last call) after every ``chunk``.
         checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
-    state = learner.create(key, params)
+    learner = learner.create(key, params)
     data, rtg = spread(data, learner.mesh)
     mazes = place(mazes, replicated(learner.mesh))
-    state = run_to(
-        updates or learner.config.updates, state, lambda state, n: learner.train(state, data, rtg, mazes, n),
-        lambda state: int(state.update), on_progress, checkpoints, chunk,
+    learner = learn(
+        learner, updates or learner.config.updates, data, rtg, mazes, checkpoints=checkpoints, chunk=chunk,
+        on_progress=lambda update, info: on_progress(update, info["loss"]),
     )  # fmt: skip
-    return jax.device_get(state.params)
+    return jax.device_get(learner.params)

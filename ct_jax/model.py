@@ -3,7 +3,7 @@
 ``weights.safetensors`` holds the arrays, ``model.json`` the robot, the settings and where they came from.
 """
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,23 +13,32 @@ import jax.numpy as jnp
 
 from ct_envs import MazeEnv, UserError
 from ct_envs.checked import shown
-from ct_envs.robots import get_robot
 from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
 from ct_jax.agent import Agent
 from ct_jax.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
+from ct_jax.configs import find_robot
+from ct_jax.controller import ControllerConfig, SacController, blank_controller
 from ct_jax.controllers.differential_drive import DifferentialDrive
-from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.files import make_folder, whole
+from ct_jax.heads import make_head
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
-from ct_jax.settings import Settings, from_dict, sac_from_dict, to_dict
+from ct_jax.settings import (
+    Settings,
+    controller_config,
+    controller_from_dict,
+    from_dict,
+    to_dict,
+    with_controller,
+)
 from ct_jax.transformer import ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
 
 ZOO = "zoo:"
-FORMAT = 3  # of model.json and controller.json; this version reads 1 to it
+FORMAT = 4  # of model.json and controller.json; this version reads 1 to it
 BOUND = 2  # from this format on, weights are bound to what the file beside them says of them
-NAMED = 3  # from this format on, the settings of a controller have the names of today
+_SETTINGS_OF = {1: 1, 2: 1, 3: 2, 4: 3}  # the format of a controller's settings in each format of its file
+PARTS = tuple(part.name for part in fields(ControllerConfig))  # of a controller's settings; before format 4 only "sac"
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,7 @@ class TrainedModel:
     robot: str
     settings: Settings
     policy: TransformerPolicy
-    controller: SacController | DifferentialDrive  # learned, as ``settings.sac`` describes it, or known
+    controller: SacController | DifferentialDrive  # learned, as the settings describe it, or known
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
     def agent(self) -> Agent:
@@ -94,7 +103,7 @@ def load_model(run: str) -> TrainedModel:
     found, number = _read_description(file, hint)
     said = {name: found.get(name) for name in ("robot", "settings")}
     try:
-        robot, settings = get_robot(said["robot"]).name, from_dict(said["settings"])
+        robot, settings = find_robot(said["robot"]).name, from_dict(said["settings"])
         _check_robot(robot, settings)
     except UserError as bad:
         raise UserError(f"{file}: not a model's description ({bad}); {hint}") from None
@@ -123,17 +132,17 @@ def _read_description(file: Path, hint: str) -> tuple[dict[str, Any], int]:
     return found, number
 
 
-def save_controller(folder: Path, robot: str, config: SacConfig, controller: SacController, made: dict) -> None:
+def save_controller(folder: Path, robot: str, config: ControllerConfig, controller: SacController, made: dict) -> None:
     """Write a controller into a folder: ``weights.safetensors``, and last ``controller.json``."""
     make_folder(folder, parents=True)
-    said = {"robot": robot, "sac": asdict(config)}
+    said = {"robot": robot} | asdict(config)
     save_weights(folder / "weights.safetensors", controller, of=said)
     write_json(folder / "controller.json", _sizes(robot) | said | {"format": FORMAT, "made": made})
 
 
 def load_controller(
     where: str, robot: str, *, hint: str = "give another, or learn your 'own'"
-) -> tuple[SacController, SacConfig]:
+) -> tuple[SacController, ControllerConfig]:
     """Read the controller of a robot from a run folder, a controller's folder, or with "zoo" the shipped one.
 
     Args:
@@ -153,10 +162,11 @@ def load_controller(
             for each in (sizes, needed)
         ]
         raise UserError(f"{file}: a controller of {words[0]}; this run needs {words[1]}; {hint}")
-    said = {name: found.get(name) for name in ("robot", "sac")}
+    parts = {name: found[name] for name in PARTS if name in found}
+    said = {"robot": found.get("robot")} | parts
     try:
-        config = sac_from_dict(said["sac"], old=number < NAMED)
-        _check_robot(robot, Settings(sac=config))
+        config = controller_from_dict(parts, _SETTINGS_OF[number])
+        _check_robot(robot, with_controller(Settings(), config))
     except UserError as bad:
         raise UserError(f"{file}: not a controller's description ({bad}); {hint}") from None
     weights = folder / "weights.safetensors"
@@ -192,7 +202,7 @@ def _sizes(robot: str) -> dict[str, Any]:
 
 def sizes(robot: str) -> tuple[int, int]:
     """Entries of a robot's proprioception and of its action."""
-    if get_robot(robot).course == "room":
+    if find_robot(robot).course == "room":
         return PROPRIO_SIZE, ACTION_SIZE
     env = MazeEnv(robot, engine="mujoco")
     return env.proprio_size, env.action_size
@@ -207,8 +217,8 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
     _check_robot(robot, settings)
     proprio_size, action_size = sizes(robot)
     maps, proprio, goal, *rest = sample_inputs(proprio_size, action_size)
-    sac = settings.sac if settings.model.skill else None
-    transformer = ControlTransformer(settings.model, action_size, sac)
+    head = make_head(settings.model, action_size, controller_config(settings))
+    transformer = ControlTransformer(settings.model, action_size, head)
     value = ValueNetwork(settings.value.width)
 
     def build(key: jax.Array) -> TransformerPolicy:
@@ -221,25 +231,25 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
             value_width=settings.value.width,
             return_scale=settings.return_scale,
             clip_target_return=settings.clip_target_return,
-            sac=sac,
+            head=head,
         )
 
     policy = jax.eval_shape(build, jax.random.key(0))
-    if get_robot(robot).course == "room":
+    if find_robot(robot).course == "room":
         return policy, DifferentialDrive()
-    return policy, _blank_sac(robot, settings.sac)
+    return policy, _blank_sac(robot, controller_config(settings))
 
 
 def _check_robot(robot: str, settings: Settings) -> None:
     """Raise UserError for settings that are not for the robot."""
-    if settings.model.skill and get_robot(robot).course == "room":
+    if settings.model.skill and find_robot(robot).course == "room":
         raise UserError(f"model.skill is for a controller that was learned; the {robot}'s is known")
-    for name, frame in (("model", settings.model.frame), ("sac", settings.sac.frame)):
-        if frame == "heading" and not get_robot(robot).has_heading:
+    for name, frame in (("model", settings.model.frame), ("augment", settings.augment.frame)):
+        if frame == "heading" and not find_robot(robot).has_heading:
             raise UserError(f"{name}.frame is 'heading', which the {robot} has not; give 'world'")
 
 
-def _blank_sac(robot: str, config: SacConfig) -> SacController:
+def _blank_sac(robot: str, config: ControllerConfig) -> SacController:
     """A controller with the shapes of its arrays."""
     return jax.eval_shape(lambda key: blank_controller(key, *sizes(robot), config), jax.random.key(0))
 

@@ -20,18 +20,19 @@ from ct_jax import devices
 from ct_jax import trajectories as storage
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.collect import collect, kept_in
-from ct_jax.controllers.sac import SacConfig
+from ct_jax.controller import ControllerConfig
 from ct_jax.evaluate import METHODS, Episodes, evaluate
 from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
+from ct_jax.heads import with_skill
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
 from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
 from ct_jax.progress import Bar, Metrics
 from ct_jax.run import Run, drop_leftovers, is_row, kept_row, open_run, training
-from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED
+from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED, with_controller
 from ct_jax.trajectories import Trajectories
-from ct_jax.transformer import ControlTransformer, with_skill
+from ct_jax.transformer import ControlTransformer
 from ct_jax.types import Controller, Policy, World
 from ct_jax.value import ValueNetwork
 from ct_jax.worlds import Request, Trial, kind_of
@@ -64,12 +65,12 @@ def _model(run: Run, metrics: Metrics) -> TrainedModel:
     folder = run.folder / "model"
     if run.done(last) is not None and devices.first((folder / "model.json").is_file):
         return load_model(str(run.folder))
-    controller, sac = kind_of(run.spec).controller(run, metrics)
+    controller, config = kind_of(run.spec).controller(run, metrics)
     data = planning_trajectories(run, controller)
-    policy = _fit(run, controller, sac, data, metrics)
+    policy = _fit(run, controller, config, data, metrics)
     if run.settings.rounds:
         policy = _finetune(run, policy, controller, data, metrics)
-    model = TrainedModel(run.robot, replace(run.settings, sac=sac), policy, controller, run.made)
+    model = TrainedModel(run.robot, with_controller(run.settings, config), policy, controller, run.made)
     devices.first(lambda: save_model(folder, model))
     return model
 
@@ -117,10 +118,12 @@ def describe(data: Trajectories) -> dict[str, Any]:
     return counts | {"mean_length": float(length.mean())}
 
 
-def _fit(run: Run, controller: Any, sac: SacConfig, data: Trajectories, metrics: Metrics) -> TransformerPolicy:
+def _fit(
+    run: Run, controller: Any, config: ControllerConfig, data: Trajectories, metrics: Metrics
+) -> TransformerPolicy:
     """Value network and transformer, from scratch but for a skill that it is given."""
-    policy, _ = blank_model(run.robot, replace(run.settings, sac=sac))
-    if policy.sac is not None:
+    policy, _ = blank_model(run.robot, with_controller(run.settings, config))
+    if run.settings.model.skill:
         policy = replace(policy, params=with_skill(policy.params, controller))
     if run.done("fit") is not None:
         return _fit_both(run, "fit", 0, policy, data, metrics)

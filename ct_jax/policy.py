@@ -2,12 +2,12 @@
 
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from ct_jax.controllers.sac import SacConfig
 from ct_jax.transformer import Cache, ControlTransformer, History, ModelConfig, empty_cache, empty_history
 from ct_jax.types import Action, Frame, Observation, act_as_intended
 from ct_jax.value import ValueNetwork
@@ -32,11 +32,11 @@ class TransformerPolicy:
     value_width: int = struct.field(pytree_node=False, default=128)
     return_scale: float = struct.field(pytree_node=False, default=1.0)  # k: condition on k * V (paper)
     clip_target_return: bool = struct.field(pytree_node=False, default=False)  # condition on at most V of this state
-    sac: SacConfig | None = struct.field(pytree_node=False, default=None)  # of the controller that is its head
+    head: nn.Module | None = struct.field(pytree_node=False, default=None)  # of the transformer: ``heads.make_head``
 
     @property
     def model(self) -> ControlTransformer:
-        return ControlTransformer(self.config, self.action_size, self.sac)
+        return ControlTransformer(self.config, self.action_size, self.head)
 
     def init(self, frame: Frame, tasks: Any = None) -> Conditioned:
         """The memory, with the return that the value network predicts from the first observation."""

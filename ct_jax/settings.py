@@ -1,7 +1,6 @@
 """All settings of a run, and how files hold them."""
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any, Final
 
 from ct_envs import UserError
@@ -9,6 +8,10 @@ from ct_envs.checked import Above, Checked, Within, from_json, shown
 from ct_envs.turtlebot3 import MAX_NOISE
 from ct_envs.turtlebot3_world import MAX_DENSITY, TRAIN_DENSITY
 from ct_jax.collect import CollectConfig
+from ct_jax.controller import ControllerConfig
+from ct_jax.controllers.augment import AugmentConfig
+from ct_jax.controllers.edges import EdgeConfig
+from ct_jax.controllers.reward import RewardConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.finetune import RecoverConfig
 from ct_jax.fit import FitConfig, ValueConfig
@@ -47,10 +50,10 @@ class Settings(Checked):
     prm: PrmConfig = PrmConfig()
     controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
     sac: SacConfig = SacConfig()
-    controller_action_scale: Annotated[float, Above(0, 1)] = (
-        1.0  # of a learned controller's actions, when it leads: with
-    )
-    # less it falls less
+    edges: EdgeConfig = EdgeConfig()
+    augment: AugmentConfig = AugmentConfig()
+    controller_action_scale: Annotated[float, Above(0, 1)] = 1.0  # of a learned controller's actions, when it leads:
+    # with less it falls less
     collect: CollectConfig = CollectConfig()
     model: ModelConfig = ModelConfig()
     value: ValueConfig = ValueConfig()
@@ -69,6 +72,16 @@ class Settings(Checked):
     rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
 
 
+def controller_config(settings: Settings) -> ControllerConfig:
+    """The settings of the low-level controller."""
+    return ControllerConfig(settings.sac, settings.edges, settings.augment)
+
+
+def with_controller(settings: Settings, config: ControllerConfig) -> Settings:
+    """The settings with those of another low-level controller."""
+    return replace(settings, sac=config.sac, edges=config.edges, augment=config.augment)
+
+
 def with_fits(settings: Settings, **changes: Any) -> Settings:
     """The settings with changes to all trainings of the transformer."""
     fits = {name: getattr(settings, name) for name in ("fit", "round_fit", "last_fit")}
@@ -77,10 +90,10 @@ def with_fits(settings: Settings, **changes: Any) -> Settings:
 
 # ----------------------------------------------------------------------------------------------------------- files
 
-FORMAT: Final = 2  # of settings in files; a file without a number is of format 1
+FORMAT: Final = 3  # of settings in files; a file without a number is of format 1
 
 # Format 1 had other names, and left settings out that came after its first version, where they had these values. The
-# values stay what they are, whatever the defaults become.
+# values stay what they are, whatever the defaults become. In format 2, "sac" was one object: see ``_settings_2``.
 _NAMES_1 = {
     "optimism": "return_scale", "reprompt": "clip_target_return", "controller_effort": "controller_action_scale",
     "effort": "action_scale",
@@ -106,27 +119,31 @@ def from_dict(values: Any) -> Settings:
     Raises:
         UserError: they are of a later version, or out of their ranges.
     """
-    return from_json(Settings, _upgraded(values, _settings_1), "settings")
+    return from_json(Settings, _upgraded(values), "settings")
 
 
-def sac_from_dict(values: Any, *, old: bool) -> SacConfig:
-    """The settings of a controller.
+def controller_from_dict(values: Any, number: int) -> ControllerConfig:
+    """The settings of a controller, which are a part of settings of this format.
 
-    Args:
-        old: they are of format 1.
+    Raises:
+        UserError: one is unknown or out of its range.
     """
-    return from_json(SacConfig, _part_1("sac", values) if old else values, "sac")
+    if number == 1 and isinstance(values, dict):
+        values = {name: _part_1(name, part) for name, part in values.items()}
+    return from_json(ControllerConfig, values if number == FORMAT else _settings_2(values), "controller")
 
 
-def _upgraded(values: Any, upgrade: Callable[[dict[str, Any]], dict[str, Any]]) -> Any:
-    """Values of any format as this version names them."""
+def _upgraded(values: Any) -> Any:
+    """Settings of any format as this version has them."""
     if not isinstance(values, dict):
         return values
     number = values.get("format", 1)
     if type(number) is not int or not 1 <= number <= FORMAT:
         raise UserError(f"settings are of format {shown(number)}; this version reads 1 to {FORMAT}")
-    rest = {name: value for name, value in values.items() if name != "format"}
-    return upgrade(rest) if number == 1 else rest
+    values = {name: value for name, value in values.items() if name != "format"}
+    for upgrade in (_settings_1, _settings_2)[number - 1 :]:
+        values = upgrade(values)
+    return values
 
 
 def _settings_1(values: dict[str, Any]) -> dict[str, Any]:
@@ -140,3 +157,17 @@ def _part_1(name: str, values: Any) -> Any:
     if not isinstance(values, dict):
         return values
     return _ABSENT_1.get(name, {}) | {_NAMES_1.get(key, key): value for key, value in values.items()}
+
+
+def _settings_2(values: Any) -> Any:
+    """Settings of format 2, in which "sac" held the settings of edges, reward and frame, too."""
+    flat = values.get("sac") if isinstance(values, dict) else None
+    if not isinstance(flat, dict):
+        return values
+
+    def part(kind: type) -> dict[str, Any]:
+        return {field.name: flat[field.name] for field in fields(kind) if field.name in flat}
+
+    edges, reward, augment = (part(kind) for kind in (EdgeConfig, RewardConfig, AugmentConfig))
+    sac = {name: value for name, value in flat.items() if name not in edges | reward | augment}
+    return values | {"sac": sac, "edges": edges | {"reward": reward}, "augment": augment}

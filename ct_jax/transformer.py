@@ -17,7 +17,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.acme.running_statistics import NestedMeanStd
 from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt8
@@ -26,7 +25,6 @@ from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Within
 from ct_envs.frames import FrameName, own_frame, turn
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.controllers.sac import SacConfig, SacController, blank_controller
 from ct_jax.dense import Dense, Dropout
 
 Attention = Literal["xla", "cudnn"]  # implementations of jax.nn.dot_product_attention
@@ -185,66 +183,6 @@ def directions(x: Float[Array, "*b W"], heading: Float[Array, "*b 2"], n: int) -
     return where.reshape(*where.shape[:-2], -1)
 
 
-class HeadingHead(nn.Module):
-    """Actions of a robot that can turn: where to go in the world, turned into the robot's frame, and how it stands.
-
-    The same gait then serves every heading, and the trunk need not know which way the body looks.
-    """
-
-    directions: int  # a mode
-    action_size: int
-    modes: int = 1
-    width: int = 256
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b M A"]:
-        heading, own = body_features(proprio)
-        where = directions(x, heading, self.modes * self.directions)
-        where = where.reshape(*where.shape[:-1], self.modes, -1)
-        own = jnp.broadcast_to(own[..., None, :], (*where.shape[:-1], own.shape[-1]))
-        hidden = jnp.concatenate([where, own], -1)
-        for _ in range(2):
-            hidden = nn.relu(Dense(self.width)(hidden))
-        return Dense(self.action_size)(hidden)
-
-
-class SkillHead(nn.Module):
-    """Actions of the trained low-level controller. For each mode, the trunk gives it a goal in the world's plane.
-
-    For a body so easily brought down that a head of one's own, which learns a gait from examples, falls. The weights
-    lie in the collection "skill", see ``with_skill``, and get no gradient.
-    """
-
-    sac: SacConfig
-    action_size: int
-    modes: int = 1
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Float[Array, "*b M A"]:
-        where = GOAL_SCALE_M * Dense(2 * self.modes)(x)
-        where = where.reshape(*where.shape[:-1], self.modes, 2)
-        body = jnp.broadcast_to(proprio[..., None, :], (*where.shape[:-1], proprio.shape[-1]))
-        blank = functools.partial(blank_controller, jax.random.key(0), proprio.shape[-1], self.action_size, self.sac)
-        skill = self.variable("skill", "controller", lambda: _skill(blank()))
-        mean, std, policy = jax.lax.stop_gradient(tuple(skill.value[name] for name in ("mean", "std", "policy")))
-        sac = self.sac
-        controller = SacController(
-            NestedMeanStd(mean, std), policy, self.action_size, sac.hidden, sac.frame, sac.action_scale
-        )
-        action = controller(body.reshape(-1, body.shape[-1]), where.reshape(-1, 2))
-        return action.reshape(*where.shape[:-1], self.action_size)
-
-
-def _skill(controller: SacController) -> dict[str, Any]:
-    """What of a controller a ``SkillHead`` keeps."""
-    return {"mean": controller.normalizer.mean, "std": controller.normalizer.std, "policy": controller.policy}
-
-
-def with_skill(params: Any, controller: SacController) -> Any:
-    """The parameters of a model with a ``SkillHead``, which now is that controller."""
-    return params | {"skill": {"head": {"controller": _skill(controller)}}}
-
-
 class Modes(NamedTuple):
     """Actions to choose from."""
 
@@ -265,12 +203,13 @@ class ControlTransformer(nn.Module):
 
     ``dtype`` is that of the computations, for training on accelerators in bfloat16; parameters and actions stay
     float32, and acting with a cache is for a model without it. ``attention`` names one of jax's implementations.
-    ``sac`` is the configuration of the controller that is the head, with ``config.skill``.
+    ``head`` gives the actions of all modes from what the trunk makes of a state token, and proprioception
+    (``heads.make_head``); without one they are linear in what the trunk makes (paper).
     """
 
     config: ModelConfig
     action_size: int
-    sac: SacConfig | None = None
+    head: nn.Module | None = None
     dtype: DTypeLike | None = None
     attention: Attention | None = None
 
@@ -288,12 +227,7 @@ class ControlTransformer(nn.Module):
         self.norm_in, self.norm_out = nn.LayerNorm(dtype=self.dtype), nn.LayerNorm(dtype=self.dtype)
         self.dropout = Dropout(c.dropout)
         self.blocks = [Block(c, self.dtype, self.attention) for _ in range(c.layers)]
-        if c.skill:
-            assert self.sac is not None
-            self.head = SkillHead(self.sac, self.action_size, c.modes)
-        elif c.frame == "heading":
-            self.head = HeadingHead(c.directions, self.action_size, c.modes)
-        else:
+        if self.head is None:
             self.predict_action = Dense(c.modes * self.action_size)
         if c.modes > 1:
             self.predict_mode = Dense(c.modes)
@@ -316,7 +250,7 @@ class ControlTransformer(nn.Module):
     def _predict(self, x: Float[Array, "*b W"], proprio: Float[Array, "*b P"]) -> Modes:
         """Actions from what the trunk makes of state tokens."""
         x, n = self.norm_out(x).astype(jnp.float32), self.config.modes
-        if self.config.skill or self.config.frame == "heading":
+        if self.head is not None:
             action = self.head(x, proprio)
         else:
             action = self.predict_action(x).reshape(*x.shape[:-1], n, self.action_size)

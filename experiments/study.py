@@ -26,15 +26,14 @@ from ct_jax import pipeline
 from ct_jax import trajectories as storage
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
 from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
-from ct_jax.baselines.sac_alone import EDGES_ONLY, train_sac_alone
+from ct_jax.baselines.sac_alone import SacAloneConfig, train_sac_alone
 from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
-from ct_jax.controllers.sac import SacConfig
+from ct_jax.configs import get_preset
 from ct_jax.evaluate import GUIDED
 from ct_jax.files import prepare_outputs
 from ct_jax.finetune import NoRecoveryError
-from ct_jax.model import load_controller
-from ct_jax.presets import get_preset
+from ct_jax.model import PARTS, load_controller
 from ct_jax.progress import Metrics
 from ct_jax.run import (
     Run,
@@ -69,7 +68,7 @@ class Variant:
     """Name in tables (default: CT or F-CT with the variant's name)."""
     tuned_from: str | None = None
     """For a fine-tuned variant: the variant before fine-tuning."""
-    baseline: CqlConfig | SacConfig | None = None
+    baseline: CqlConfig | SacAloneConfig | None = None
     """Baseline to train instead of a transformer: CQL on the run's data, or SAC without data."""
     sweeps: tuple[str, ...] = ()
     """Turtlebot3: further evaluations: "density", "noise", "seven"."""
@@ -100,11 +99,11 @@ def pt_cql_config(frame: str = "world") -> CqlConfig:
     return CqlConfig(updates=2500, mirror=True, frame=frame)
 
 
-def sac_alone_config(robot: str) -> SacConfig:
+def sac_alone_config(robot: str) -> SacAloneConfig:
     """Settings of SAC alone: the controller's learner in the whole maze. Longer paths need a larger discount factor."""
-    sac = get_preset("cpu", robot).sac
-    changes = {"discount": 0.99, "iterations": SAC_ALONE_ITERATIONS, "reward_scale": 0.1, "alive_bonus": 0.0}
-    return replace(sac, **changes, **EDGES_ONLY)
+    settings = get_preset("cpu", robot)
+    sac = replace(settings.sac, discount=0.99, iterations=SAC_ALONE_ITERATIONS, reward_scale=0.1)
+    return SacAloneConfig(sac, replace(settings.edges.reward, alive_bonus=0.0), settings.augment.frame)
 
 
 def load_variants(robot: str) -> dict[str, Variant]:
@@ -279,7 +278,7 @@ def reference(run: Run) -> dict[str, float]:
 
 # The settings that a stage depends on, in addition to those of the stage before it.
 STAGES = {
-    "controller": ("prm", "controller", "sac"),
+    "controller": ("prm", "controller", *PARTS),
     "collect": ("controller_action_scale", "collect", "rooms", "random_mazes"),
     "fit": ("model", "fit", "value"),
 }
@@ -368,7 +367,7 @@ def digest_words(*values: Any) -> str:
     return hashlib.sha256(words.encode()).hexdigest()[:12]
 
 
-def digest(settings: Settings, baseline: CqlConfig | SacConfig | None = None) -> str:
+def digest(settings: Settings, baseline: CqlConfig | SacAloneConfig | None = None) -> str:
     """A digest of settings, and of those of a baseline."""
     return digest_words(to_dict(settings), *([asdict(baseline)] if baseline else []))
 
@@ -431,20 +430,20 @@ def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, 
     return baseline(run, name, learn, config, config.updates, config.width)
 
 
-def sac_alone(run: Run, config: SacConfig) -> list[dict[str, Any]]:
+def sac_alone(run: Run, config: SacAloneConfig) -> list[dict[str, Any]]:
     """Rows of SAC alone, trained in the run's maze without the run's data."""
 
     def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
         return train_sac_alone(key, functools.partial(make_env, run), next(iter(run.mazes.values())), config, **watch)
 
-    return baseline(run, "sac", learn, config, config.iterations, config.hidden[0])
+    return baseline(run, "sac", learn, config, config.sac.iterations, config.sac.hidden[0])
 
 
-BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: pt_cql, SacConfig: sac_alone}
+BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: pt_cql, SacAloneConfig: sac_alone}
 
 
 def baseline(
-    run: Run, name: str, learn: Callable, config: CqlConfig | SacConfig, total: int, width: int
+    run: Run, name: str, learn: Callable, config: CqlConfig | SacAloneConfig, total: int, width: int
 ) -> list[dict[str, Any]]:
     """Rows of one baseline. It is trained first unless it is finished."""
     frame, stage = config.frame, f"baselines/{name}"

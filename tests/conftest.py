@@ -212,7 +212,8 @@ def tiny_settings():
     fit = p.FitConfig(updates=40, batch=4, steps=8)
     return p.Settings(
         prm=p.PrmConfig(samples=40, most_samples=40),
-        sac=p.SacConfig(envs=4, iterations=50, updates=1, warmup=2, batch=8, hidden=(8,), replay=200, episode_steps=5),
+        sac=p.SacConfig(envs=4, iterations=50, updates=1, warmup=2, batch=8, hidden=(8,), replay=200),
+        edges=p.EdgeConfig(episode_steps=5),
         collect=p.CollectConfig(
             trajectories=2, envs=8, horizon=50, reset_interval=8, starts="maze", guide="explorer", give_up=1000
         ),
@@ -233,10 +234,11 @@ def tiny(monkeypatch, tiny_settings):
 
 def _know_tiny(patch: pytest.MonkeyPatch, settings) -> None:
     from ct_envs import robots
-    from ct_jax import cli, presets
+    from ct_jax import cli
+    from ct_jax.configs import point
 
     patch.setitem(robots.ROBOTS, "point", dataclasses.replace(robots.POINT, horizon=50))
-    patch.setitem(presets.PRESETS, "tiny", settings)
+    patch.setitem(point.PRESETS, "tiny", settings)
     patch.setattr(cli, "prepare_jax", lambda *_: None)
 
 

@@ -24,6 +24,7 @@ from ct_jax.collect import CollectConfig, collect
 from ct_jax.evaluate import evaluate
 from ct_jax.fit import Fit, FitConfig, fit, init_params, spread, transformer_loss
 from ct_jax.interrupts import interruptible, raise_if_interrupted
+from ct_jax.learner import updates_on
 from ct_jax.pairs import Pairs
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
@@ -106,7 +107,8 @@ def traffic() -> dict[str, np.ndarray]:
     made, params = learner()
     data, rtg = spread(load(FOLDER / "data.npz"), made.mesh)
     mazes = devices.place(MAZES, devices.replicated(made.mesh))
-    program = made.train.lower(made.create(jax.random.key(1), params), data, rtg, mazes, 2).compile().as_text()
+    ready = made.create(jax.random.key(1), params)
+    program = updates_on(made.mesh).lower(ready, data, rtg, mazes, updates=2).compile().as_text()  # pyright: ignore
     moved = re.findall(r"= \(?(.*?)\)? (?:all-gather|all-to-all|collective-permute)(?:-start)?\(", program)
     shapes = [shape.split(",") for text in moved for shape in re.findall(r"\[([\d,]+)\]", text)]
     sizes = [np.prod([int(n) for n in shape]) for shape in shapes]

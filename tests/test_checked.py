@@ -14,12 +14,28 @@ from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Share, Within, from_json, shown
 from ct_envs.turtlebot3 import Turtlebot3Config
 from ct_jax.baselines.cql import CqlConfig
-from ct_jax.presets import CollectConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, SacConfig, ValueConfig
-from ct_jax.settings import RoomConfig, Settings, from_dict, to_dict
+from ct_jax.baselines.sac_alone import SacAloneConfig
+from ct_jax.controller import ControllerConfig
+from ct_jax.settings import (
+    AugmentConfig,
+    CollectConfig,
+    EdgeConfig,
+    FitConfig,
+    ModelConfig,
+    PrmConfig,
+    RecoverConfig,
+    RewardConfig,
+    RoomConfig,
+    SacConfig,
+    Settings,
+    ValueConfig,
+    from_dict,
+    to_dict,
+)
 
 CONFIGS = [
-    CollectConfig, CqlConfig, FitConfig, ModelConfig, PrmConfig, RecoverConfig, RoomConfig, SacConfig, Settings,
-    Turtlebot3Config, ValueConfig,
+    AugmentConfig, CollectConfig, ControllerConfig, CqlConfig, EdgeConfig, FitConfig, ModelConfig, PrmConfig,
+    RecoverConfig, RewardConfig, RoomConfig, SacAloneConfig, SacConfig, Settings, Turtlebot3Config, ValueConfig,
 ]  # fmt: skip
 FREE_TEXT = {"Settings.controller", "Turtlebot3Config.urdf"}  # names of a folder and a file
 
@@ -101,12 +117,12 @@ WRONG = [
     (SacConfig, {"hidden": [8]}, "hidden is [8]"),
     (SacConfig, {"hidden": ()}, "hidden is ()"),
     (SacConfig, {"hidden": (8, 0)}, "for each entry a whole number from 1 to 16384"),
-    (SacConfig, {"fall_m": (1.0,)}, "a tuple of 2 entries"),
-    (SacConfig, {"fall_ramp": (0.5, 0.2)}, "SacConfig.fall_ramp is (0.5, 0.2)"),
-    (SacConfig, {"turn_ramp": (0.5, 0.2)}, "SacConfig.turn_ramp"),
-    (SacConfig, {"through": True}, "set chain"),
+    (RewardConfig, {"fall_m": (1.0,)}, "a tuple of 2 entries"),
+    (RewardConfig, {"fall_ramp": (0.5, 0.2)}, "RewardConfig.fall_ramp is (0.5, 0.2)"),
+    (EdgeConfig, {"turn_ramp": (0.5, 0.2)}, "EdgeConfig.turn_ramp"),
+    (EdgeConfig, {"through": True}, "set chain"),
     (SacConfig, {"replay": 3}, "at least the number of envs, 64"),
-    (SacConfig, {"frame": "body"}, "one of world, heading"),
+    (AugmentConfig, {"frame": "body"}, "one of world, heading"),
     (CollectConfig, {"guide": "oracle"}, "one of roadmap, shortcut, explorer"),
     (CollectConfig, {"starts": "corners"}, "CollectConfig.starts is 'corners'; give one of vertices, maze"),
     (RecoverConfig, {"keep": "somehow"}, "one of separate, joined, relabelled"),

@@ -28,10 +28,11 @@ FOLDER = "jax_compilation_cache_dir"
 def count(arguments, settings, home, file):
     """Run a command in a separate process, which records the number of programs and of cache hits."""
     from ct_envs import robots
-    from ct_jax import cli, presets
+    from ct_jax import cli
+    from ct_jax.configs import point
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
-    presets.PRESETS["tiny"] = settings
+    point.PRESETS["tiny"] = settings
     os.environ["XDG_CACHE_HOME"] = str(home)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     seen = Counter()

@@ -10,6 +10,7 @@ import pytest
 from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql, transitions
 from ct_jax.checkpoint import Checkpoints
+from ct_jax.learner import train
 from ct_jax.trajectories import sample_windows, select
 from ct_jax.worlds.mazes import as_frame, start_episodes
 from ct_jax.worlds.mazes import run as roll_out
@@ -148,7 +149,7 @@ def careless():
 def taught(learner, data):
     state = learner.create(jax.random.key(0), data)
     for _ in range(3):
-        state, info = learner.train(state, data, MAZES, 100)
+        state, info = train(state, 100, data, MAZES)
     assert np.isfinite(list(info.values())).all()
     return state
 
@@ -210,7 +211,7 @@ def test_the_soft_maximum_is_that_of_all_actions(fork):
 
 def test_the_target_follows_at_its_rate(learner, arriving):
     state = learner.create(jax.random.key(0), arriving)
-    after, _ = learner.train(state, arriving, MAZES, 1)
+    after, _ = train(state, 1, arriving, MAZES)
     rate = TINY.target_rate
     jax.tree.map(
         lambda old, new, now: np.testing.assert_allclose(new, (1 - rate) * old + rate * now, atol=1e-6),

@@ -34,14 +34,13 @@ from tables import (
     transfer_table,
 )
 
-from ct_envs import MazeEnv, UserError
+from ct_envs import UserError
 from ct_envs.robots import get_robot
 from ct_jax.baselines.cql import CqlConfig
-from ct_jax.baselines.sac_alone import SacAlone
+from ct_jax.baselines.sac_alone import SacAloneConfig
 from ct_jax.checkpoint import read_json
-from ct_jax.controllers.sac import SacConfig
+from ct_jax.configs import get_preset
 from ct_jax.finetune import NoRecoveryError
-from ct_jax.presets import get_preset
 from ct_jax.run import Run, load_mazes
 from ct_jax.settings import with_fits
 
@@ -125,8 +124,8 @@ def test_variants_match_methods_of_table(robot):
         assert replace(longer, fit=one.fit, last_fit=one.last_fit) == one
     assert variants["modes"].model.commitment > variants["modes-ct"].model.commitment == 0.0
     sac = known["sac"].baseline
-    assert isinstance(sac, SacConfig) and sac.iterations >= 4 * get_robot(robot).horizon
-    SacAlone(MazeEnv(robot, engine="mujoco"), replace(sac, replay=2000))  # the settings are valid for it
+    assert isinstance(sac, SacAloneConfig) and sac.sac.iterations >= 4 * get_robot(robot).horizon
+    assert sac.reward.alive_bonus == 0.0  # of the maze's reward: minus the distance
 
 
 def test_unknown_variant_is_error():
@@ -189,7 +188,7 @@ def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
     mazes = ((tiny_run.arguments[tiny_run.arguments.index("--maze") + 1],), ("antmaze-umaze",))
     monkeypatch.setattr(study, "default_mazes", lambda robot: mazes)
     cql = CqlConfig(updates=2, batch=4, width=8, samples=1)
-    sac = replace(tiny_settings.sac, iterations=4, warmup=1)
+    sac = SacAloneConfig(replace(tiny_settings.sac, iterations=4, warmup=1))
     variants = {
         "one": Variant("tiny"), "pt-cql": Variant("tiny", baseline=cql), "sac": Variant("tiny", baseline=sac),
     }  # fmt: skip
@@ -209,7 +208,7 @@ def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
 def test_sac_alone_needs_no_controller_and_no_data(tiny_settings, tiny_study, monkeypatch):
     """Its run contains only a policy and rows: no controller and no trajectories."""
     monkeypatch.setattr(study, "default_mazes", lambda robot: (("antmaze-umaze",), ()))
-    sac = replace(tiny_settings.sac, iterations=4, warmup=1)
+    sac = SacAloneConfig(replace(tiny_settings.sac, iterations=4, warmup=1))
     (row,) = tiny_study.run({"sac": Variant("tiny", baseline=sac)}, (0,), ignore).rows
     assert row.method == "sac" and row.controller is None
     assert not any((tiny_study.out / "sac-0" / stage).exists() for stage in study.STAGES)

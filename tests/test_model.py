@@ -21,7 +21,7 @@ from ct_jax.model import (
     save_model,
     zoo_names,
 )
-from ct_jax.settings import Settings
+from ct_jax.settings import Settings, controller_config
 from ct_jax.transformer import ControlTransformer, ModelConfig, empty_cache
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
@@ -165,7 +165,8 @@ def test_without_compilation(model, tmp_path):
 
 @pytest.fixture
 def controller_folder(model, tmp_path):
-    save_controller(tmp_path / "controller", "point", SETTINGS.sac, model.controller, {"command": "ct-jax train point"})
+    config = controller_config(SETTINGS)
+    save_controller(tmp_path / "controller", "point", config, model.controller, {"command": "ct-jax train point"})
     return tmp_path
 
 
@@ -174,7 +175,7 @@ def test_a_controller_acts_as_before(model, controller_folder):
     for where in (controller_folder, controller_folder / "controller"):  # a run's folder, or the controller's own
         found, config = load_controller(str(where), "point")
         np.testing.assert_array_equal(found(proprio, goal), model.controller(proprio, goal))
-        assert config == SETTINGS.sac
+        assert config == controller_config(SETTINGS)
 
 
 def test_the_controller_of_another_robot_is_refused_and_both_are_described(controller_folder):

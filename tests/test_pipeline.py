@@ -162,7 +162,7 @@ def test_run_keeps_copy_of_given_controller(tiny_run, tiny_settings, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, given, again)
     done = run.done("controller")
     assert done is not None and done["given"] == str(source)
-    assert given.action_scale == config.action_scale == 0.5 * tiny_settings.sac.action_scale
+    assert given.action_scale == config.sac.action_scale == 0.5 * tiny_settings.sac.action_scale
 
 
 def test_random_mazes_are_fixed():
@@ -434,7 +434,8 @@ def test_all_stages_run_without_jit(jit_disabled, tmp_path, tiny_settings, monke
     settings = change(
         tiny_settings,
         prm=change(tiny_settings.prm, samples=12),
-        sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4, episode_steps=2, held_out=0.05),
+        sac=change(tiny_settings.sac, envs=1, iterations=3, batch=1, replay=4),
+        edges=change(tiny_settings.edges, episode_steps=2, held_out=0.05),
         collect=change(tiny_settings.collect, trajectories=1, envs=4, horizon=2, reset_interval=4, guide="roadmap"),
         rounds=0,  # a round would be a second fit; recoveries have their own test without jit
         fit=fit,

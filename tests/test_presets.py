@@ -6,9 +6,15 @@ from dataclasses import asdict, fields, is_dataclass, replace
 import pytest
 
 from ct_envs import UserError
+from ct_jax.configs import get_preset
+from ct_jax.configs.point import PRESETS
+from ct_jax.controller import ControllerConfig
+from ct_jax.controllers.augment import AugmentConfig
+from ct_jax.controllers.edges import EdgeConfig
+from ct_jax.controllers.reward import RewardConfig
+from ct_jax.controllers.sac import SacConfig
 from ct_jax.fit import FitConfig
-from ct_jax.presets import PRESETS, get_preset
-from ct_jax.settings import Settings, from_dict, to_dict
+from ct_jax.settings import Settings, from_dict, to_dict, with_controller
 from ct_jax.transformer import ModelConfig
 
 ALL = (
@@ -19,6 +25,14 @@ ALL = (
         "many mazes": Settings(random_mazes=3),
         "modes": Settings(model=ModelConfig(modes=4, commitment=3.0)),
         "skill with a stride": Settings(model=ModelConfig(skill=True, stride=3)),
+        "edges": with_controller(
+            Settings(),
+            ControllerConfig(
+                SacConfig(iterations=9),
+                EdgeConfig(reward=RewardConfig(fall_ramp=(0.1, 0.9), tilt_m=2.0), chain=True, turn_ramp=(0.2, 0.3)),
+                AugmentConfig(frame="heading", mirror=True),
+            ),
+        ),
         "rounds": Settings(rounds=2, round_fit=FitConfig(updates=3, mirror=True, turns=True)),
     }
 )
@@ -43,8 +57,16 @@ LEFT_OUT = {
 }  # fmt: skip
 
 
+def as_format_2(settings):
+    """What the second version wrote of the same settings: those of a controller in one object."""
+    values = asdict(settings)
+    edges = values.pop("edges")
+    values["sac"] |= edges.pop("reward") | edges | values.pop("augment")
+    return values
+
+
 def as_format_1(values):
-    """What the first version wrote of the same settings."""
+    """What the first version wrote of the same settings, given those of the second."""
     if not isinstance(values, dict):
         return values
     return {
@@ -56,14 +78,20 @@ def as_format_1(values):
 
 @pytest.mark.parametrize("name", ALL)
 def test_files_of_the_first_version_mean_what_they_meant(name):
-    old = as_format_1(asdict(ALL[name]))
+    old = as_format_1(as_format_2(ALL[name]))
     assert not any(f'"{new}"' in json.dumps(old) for new in OLD_NAMES)
     assert from_dict(json.loads(json.dumps(old))) == ALL[name]
 
 
-@pytest.mark.parametrize("number", [0, 3, 2.0, "2", True, None])
+@pytest.mark.parametrize("name", ALL)
+def test_files_of_the_second_version_mean_what_they_meant(name):
+    old = {"format": 2} | as_format_2(ALL[name])
+    assert from_dict(json.loads(json.dumps(old))) == ALL[name]
+
+
+@pytest.mark.parametrize("number", [0, 4, 2.0, "2", True, None])
 def test_settings_of_an_unknown_format_are_refused(number):
-    with pytest.raises(UserError, match=r"format .*; this version reads 1 to 2"):
+    with pytest.raises(UserError, match=r"format .*; this version reads 1 to 3"):
         from_dict(to_dict(Settings()) | {"format": number})
 
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ct_jax import pipeline, presets
+from ct_jax import pipeline
 from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.configs import point, turtlebot3
 from ct_jax.fit import FitConfig, ValueConfig
 from ct_jax.settings import RoomConfig
 
@@ -33,10 +34,10 @@ OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scan
 def live(arguments, settings, folder, stage, operations, cache):
     """Run to the end, or for a number of file operations after the first one in a stage's folder."""
     from ct_envs import robots
-    from ct_jax import checkpoint, cli, presets
+    from ct_jax import checkpoint, cli
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
-    presets.PRESETS["tiny"] = presets.TURTLEBOT3_PRESETS["tiny"] = settings
+    point.PRESETS["tiny"] = turtlebot3.PRESETS["tiny"] = settings
     cli.prepare_jax = lambda *_: None
     jax.config.update("jax_compilation_cache_dir", cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -131,15 +132,15 @@ def test_six_kills_in_rooms(fork, tmp_path):
     stages = ("collect", "fit", "finetune", "evaluate")
     fit = FitConfig(updates=6, batch=4, steps=5, warmup=2)
     settings = replace(
-        presets.TURTLEBOT3_CPU,
-        collect=replace(presets.TURTLEBOT3_CPU.collect, trajectories=6, envs=4, reset_interval=2),
-        model=replace(presets.TURTLEBOT3_CPU.model, layers=1, heads=2, width=16),
+        turtlebot3.CPU,
+        collect=replace(turtlebot3.CPU.collect, trajectories=6, envs=4, reset_interval=2),
+        model=replace(turtlebot3.CPU.model, layers=1, heads=2, width=16),
         value=ValueConfig(fit=replace(fit, steps=1), width=16),
         fit=fit,
         rounds=2,
         round_fit=fit,
         last_fit=None,
-        recover=replace(presets.TURTLEBOT3_CPU.recover, recoveries=2, patience=20, stuck_steps=15, stuck_m=0.1),
+        recover=replace(turtlebot3.CPU.recover, recoveries=2, patience=20, stuck_steps=15, stuck_m=0.1),
         episodes=2,
         rooms=RoomConfig(worlds=2),
     )

@@ -15,9 +15,10 @@ from flax import struct
 
 from ct_envs import UserError
 from ct_envs.turtlebot3 import Turtlebot3Config
-from ct_jax import cli, pipeline, presets, settings
+from ct_jax import cli, pipeline, settings
 from ct_jax.cli import main
 from ct_jax.collect import CollectConfig, Wave, collect, kept_in
+from ct_jax.configs import turtlebot3
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.evaluate import METHODS, Episodes, evaluate
 from ct_jax.finetune import RecoverConfig, recover
@@ -36,9 +37,9 @@ pytestmark = [
 FIT = FitConfig(updates=6, batch=4, steps=5, warmup=2, mirror=True)
 COLLECT = CollectConfig(trajectories=3, reset_interval=2, guide="shortcut", starts="maze", envs=4, horizon=400)
 TINY = replace(
-    presets.TURTLEBOT3_CPU,
+    turtlebot3.CPU,
     collect=COLLECT,
-    model=replace(presets.TURTLEBOT3_CPU.model, layers=1, heads=2, width=16),
+    model=replace(turtlebot3.CPU.model, layers=1, heads=2, width=16),
     value=settings.ValueConfig(fit=replace(FIT, steps=1), width=16),
     fit=FIT,
     rounds=1,
@@ -59,7 +60,7 @@ class Trained:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets.TURTLEBOT3_PRESETS, "tiny", TINY)
+        patch.setitem(turtlebot3.PRESETS, "tiny", TINY)
         patch.setattr(cli, "prepare_jax", lambda *_: None)
         folder = str(tmp_path_factory.mktemp("runs") / "turtlebot3")
         arguments = ["train", "turtlebot3", "--preset", "tiny", "--out", folder]

@@ -8,33 +8,34 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training import replay_buffers
-from brax.training.acme import running_statistics, specs
 from brax.training.types import Transition
 
 from ct_envs import ANT, POINT, MazeEnv, Tasks, UserError, load_maze
 from ct_envs.frames import symmetries
 from ct_jax.checkpoint import Checkpoints
-from ct_jax.controllers.sac import (
-    Replay,
-    Sac,
-    SacConfig,
+from ct_jax.controller import (
+    ControllerConfig,
     SacController,
-    chain_tasks,
-    controller_networks,
+    blank_controller,
     edge_success,
     edges_in_a_row,
-    input_size,
-    split_edges,
+    learned,
+    start_training,
     train_controller,
 )
+from ct_jax.controllers.augment import AugmentConfig
+from ct_jax.controllers.edges import EdgeConfig, EdgeTask, chain_tasks, split_edges
+from ct_jax.controllers.off_policy import OffPolicy, Replay
+from ct_jax.controllers.reward import RewardConfig
+from ct_jax.controllers.sac import SacConfig
 from ct_jax.prm import PrmConfig, build_roadmap
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 
 UMAZE = load_maze("antmaze-umaze")
-TINY = SacConfig(
-    envs=4, iterations=8, updates=2, warmup=3, batch=8, hidden=(8,), replay=64, episode_steps=4, held_out=0.2
-)
+SAC = SacConfig(envs=4, iterations=8, updates=2, warmup=3, batch=8, hidden=(8,), replay=64)
+EDGES = EdgeConfig(episode_steps=4, held_out=0.2)
+TINY = ControllerConfig(SAC, EDGES)
 ENV = functools.partial(MazeEnv, POINT, engine="mujoco")
 
 
@@ -43,18 +44,34 @@ def roadmap():
     return build_roadmap(jax.random.key(0), UMAZE, radius_m=0.5, config=PrmConfig(samples=40))
 
 
-def make(config: SacConfig = TINY, robot=POINT) -> Sac:
-    return Sac(MazeEnv(robot, engine="mujoco", maps=False, horizon=config.episode_steps), config)
+def with_sac(**changes) -> ControllerConfig:
+    return replace(TINY, sac=replace(SAC, **changes))
+
+
+def with_edges(reward: RewardConfig | None = None, **changes) -> ControllerConfig:
+    return replace(TINY, edges=replace(EDGES, reward=reward or RewardConfig(), **changes))
+
+
+def env_of(config: ControllerConfig = TINY, robot=POINT) -> MazeEnv:
+    return MazeEnv(robot, engine="mujoco", maps=False, horizon=config.edges.episode_steps)
+
+
+def task_of(config: ControllerConfig = TINY, robot=POINT) -> EdgeTask:
+    return EdgeTask(env_of(config, robot), config.edges, config.augment, config.sac.discount)
+
+
+def start(tasks: Tasks, config: ControllerConfig = TINY, robot=POINT, seed: int = 0) -> OffPolicy:
+    return start_training(jax.random.key(seed), env_of(config, robot), UMAZE, tasks, config)
 
 
 @pytest.fixture(scope="module")
-def sac():
-    return make()
+def train_tasks(roadmap):
+    return split_edges(roadmap, 0.2, 0)[0]
 
 
 @pytest.fixture(scope="module")
-def fresh(sac, roadmap):
-    return sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+def fresh(train_tasks):
+    return start(train_tasks)
 
 
 def leaves(tree) -> list[np.ndarray]:
@@ -111,32 +128,37 @@ def test_too_few_edges_are_an_error(roadmap):
 # ------------------------------------------------------------------------------------------------------- training
 
 
-def test_a_few_iterations(sac, fresh):
+def test_a_few_iterations(fresh):
     """Nothing is learned in the warm-up; afterwards everything moves, and stays finite."""
-    warm, _ = sac.train(fresh, TINY.warmup)
-    assert same(warm.policy, fresh.policy) and same(warm.critic, fresh.critic)
-    after, metrics = sac.train(warm, 5)
+    warm, _ = fresh.train(SAC.warmup)
+    assert same(warm.learner.policy, fresh.learner.policy) and same(warm.learner.critic, fresh.learner.critic)
+    after, metrics = warm.train(5)
     for name in ("policy", "critic", "target_critic", "log_alpha"):
-        assert not same(getattr(after, name), getattr(warm, name)), name
+        assert not same(getattr(after.learner, name), getattr(warm.learner, name)), name
     assert all(np.isfinite(leaf).all() for leaf in leaves(after)) and np.isfinite(list(metrics.values())).all()
     assert int(after.iteration) == 8
     assert {"reward", "success", "episodes", "critic_loss", "actor_loss", "alpha"} <= set(metrics)
 
 
-def test_the_replay_holds_what_happened(sac, fresh):
+def test_learners_that_are_alike_share_one_program(train_tasks, fresh):
+    """A second training with the same settings compiles no networks of its own."""
+    assert start(train_tasks).learner.networks is fresh.learner.networks
+
+
+def test_the_replay_holds_what_happened(fresh):
     """Row by row: what was seen, done and rewarded, in order, until the oldest is overwritten."""
     state, rows = fresh, []
-    collect = jax.jit(sac._collect)
+    collect = jax.jit(OffPolicy.collect)
     for _ in range(3):
         before = state
         state, _ = collect(before)
         seen, now = (np.concatenate([s.env.obs["proprio"], s.env.obs["goal"]], -1) for s in (before, state))
         rows.append((seen, now, np.asarray(state.env.done), np.asarray(state.env.info["truncation"])))
-    data = np.asarray(state.replay.data)[: 3 * TINY.envs]
-    unflatten = sac._buffer._unflatten_fn  # of rows, each a flat transition
+    data = np.asarray(state.replay.data)[: 3 * SAC.envs]
+    unflatten = state.buffer._unflatten_fn  # of rows, each a flat transition
     kept = unflatten(data)
     for i, (seen, now, done, truncation) in enumerate(rows):
-        part = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i * TINY.envs : (i + 1) * TINY.envs], kept)
+        part = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i * SAC.envs : (i + 1) * SAC.envs], kept)
         np.testing.assert_array_equal(part.observation, seen)
         np.testing.assert_array_equal(part.next_observation, now)
         np.testing.assert_array_equal(part.discount, 1 - done)
@@ -146,7 +168,7 @@ def test_the_replay_holds_what_happened(sac, fresh):
         state, _ = collect(state)
     newest = np.concatenate([state.env.obs["proprio"], state.env.obs["goal"]], -1)
     kept = unflatten(np.asarray(state.replay.data))
-    assert len(kept.reward) == TINY.replay
+    assert len(kept.reward) == SAC.replay
     found = [(np.asarray(kept.next_observation) == row).all(1).any() for row in newest]
     assert all(found)
 
@@ -165,32 +187,34 @@ def test_the_ring_gives_what_braxs_queue_gives(size):
         assert same(drawn, expected) and int(ring.size(ours)) == int(queue.size(theirs))
 
 
-def test_the_target_follows_at_its_rate(sac, fresh):
-    state, _ = sac.train(fresh, TINY.warmup + 2)
-    after, _ = jax.jit(make(replace(TINY, updates=1))._updates)(state)
-    rate = TINY.target_rate
-    for old, new, critic in zip(*map(leaves, (state.target_critic, after.target_critic, after.critic)), strict=True):
+def test_the_target_follows_at_its_rate(train_tasks):
+    state, _ = start(train_tasks, with_sac(updates=1)).train(SAC.warmup + 2)
+    before = state.learner
+    after = jax.jit(OffPolicy.learn)(state)[0].learner
+    rate = SAC.target_rate
+    for old, new, critic in zip(*map(leaves, (before.target_critic, after.target_critic, after.critic)), strict=True):
         np.testing.assert_allclose(new, (1 - rate) * old + rate * critic, atol=1e-6)
-    assert not same(state.target_critic, after.target_critic)
+    assert not same(before.target_critic, after.target_critic)
 
 
 @pytest.mark.parametrize("kind", ["velocity", "distance"])
-def test_rewards(kind, roadmap):
+def test_rewards(kind):
     """Velocity: metres nearer per second. Distance: minus the metres that are left. The bonus: at the goal only."""
     robot = replace(POINT, controller_reward=kind)
-    sac = make(robot=robot)
+    task = task_of(robot=robot)
     tasks = Tasks(jnp.array([[6.0, 6.0], [6.0, 6.0]]), jnp.array([[6.9, 6.0], [6.0, 14.0]]), jnp.asarray(2))
-    state = sac.create(jax.random.key(1), UMAZE, tasks).env
+    state = start(tasks, robot=robot, seed=1).env
     before = np.linalg.norm(state.obs["goal"], axis=-1)
-    step, reward = jax.jit(jax.vmap(sac.env.step)), jax.jit(sac._reward)
+    step, reward = jax.jit(jax.vmap(task.env.step)), jax.jit(task.reward)
     arrived = False
     for _ in range(4):
-        action = jnp.tile(jnp.array([[1.0, 0.0]]), (TINY.envs, 1))
+        action = jnp.tile(jnp.array([[1.0, 0.0]]), (SAC.envs, 1))
         after = step(state, action)
         left = -np.asarray(after.reward)
         dense = (before - left) / 0.1 if kind == "velocity" else -left
         won = (np.asarray(after.info["success"]) * np.asarray(after.done)) > 0
-        np.testing.assert_allclose(reward(state, action, after), dense + TINY.arrival_bonus * won, atol=1e-3)
+        bonus = EDGES.reward.arrival_bonus * won
+        np.testing.assert_allclose(reward(state, action, after), dense + bonus, atol=1e-3)
         arrived |= won.any() and not won.all()
         state, before = after, np.linalg.norm(after.obs["goal"], axis=-1)
     assert arrived
@@ -198,54 +222,49 @@ def test_rewards(kind, roadmap):
 
 def test_an_alive_bonus_is_all_that_a_fall_costs():
     """And being faster than asked for earns no more, while action_scale has its price."""
-    config = replace(TINY, alive_bonus=2.0, speed_mps=1.0, action_cost=0.5, arrival_bonus=0.0)
-    sac = make(config)
-    state = sac.create(
-        jax.random.key(1), UMAZE, Tasks(jnp.array([[6.0, 6.0]]), jnp.array([[6.0, 14.0]]), jnp.asarray(1))
-    )
-    left = np.linalg.norm(state.env.obs["goal"], axis=-1) - np.array([0.05, 0.2, -0.2, 0.05])  # in 0.1 s
+    config = with_edges(RewardConfig(alive_bonus=2.0, speed_mps=1.0, action_cost=0.5, arrival_bonus=0.0))
+    task = task_of(config)
+    state = start(Tasks(jnp.array([[6.0, 6.0]]), jnp.array([[6.0, 14.0]]), jnp.asarray(1)), config, seed=1).env
+    left = np.linalg.norm(state.obs["goal"], axis=-1) - np.array([0.05, 0.2, -0.2, 0.05])  # in 0.1 s
     fall = jnp.array([0.0, 0.0, 0.0, 1.0])
-    after = state.env.replace(reward=jnp.asarray(-left), done=fall, info=state.env.info | {"fall": fall})
-    reward = sac._reward(state.env, jnp.full((4, 2), 0.5), after)
+    after = state.replace(reward=jnp.asarray(-left), done=fall, info=state.info | {"fall": fall})
+    reward = task.reward(state, jnp.full((4, 2), 0.5), after)
     np.testing.assert_allclose(reward, np.array([0.5, 1.0, -2.0, 0.5]) - 0.125 + [2, 2, 2, 0], atol=1e-4)
     batch = Transition(jnp.zeros((4, 4)), jnp.zeros((4, 2)), reward, 1.0 - fall, jnp.zeros((4, 4)),
                        {"state_extras": {"truncation": 0 * fall, "fall": fall}})  # fmt: skip
-    assert same(sac._pay_falls(batch, jnp.array(0)), batch)
+    assert same(task.reward.pay_falls(batch, jnp.array(0.0), 0.9), batch)
 
 
-def test_what_diverges_is_kept_and_paid_like_a_fall(monkeypatch, tmp_path, roadmap):
+def test_what_diverges_is_kept_and_paid_like_a_fall(monkeypatch, tmp_path, train_tasks):
     """Its last reward, what it costs for ever, and that nothing follows, even where arrivals end nothing."""
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warning there
-    sac = make(replace(TINY, chain=True, through=True))
-    state = sac.create(jax.random.key(0), UMAZE, chain_tasks(split_edges(roadmap, 0.2, 0)[0], 0))
+    state = start(chain_tasks(train_tasks, 0), with_edges(chain=True, through=True))
     physics = state.env.pipeline_state
     sick = state.env.replace(pipeline_state=physics.replace(qvel=physics.qvel.at[1, 0].set(jnp.inf)))
-    after, _ = sac._collect(state.replace(env=sick))
-    kept = sac._buffer._unflatten_fn(after.replay.data[: TINY.envs])
+    after, _ = state.replace(env=sick).collect()
+    kept = after.buffer._unflatten_fn(after.replay.data[: SAC.envs])
     np.testing.assert_array_equal(after.env.info["diverged"], [0, 1, 0, 0])
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(kept))
     assert kept.reward[1] == after.env.reward[1] < 0  # minus the distance, as a fall's
-    drawn = sac._present(kept, jax.tree.map(lambda leaf: leaf[0], after.env.info["maze"]), jax.random.key(0))
+    drawn = state.task.present(kept, after.maze, jax.random.key(0), jnp.array(0.0))
     np.testing.assert_array_equal(drawn.discount, [1, 0, 1, 1])
-    paid = sac._pay_falls(drawn, jnp.asarray(0)).reward
-    expected = (kept.reward[1] - TINY.fall_m[0]) / (1.0 - TINY.discount)
-    np.testing.assert_allclose(paid, kept.reward.at[1].set(expected), rtol=1e-5)
+    expected = (kept.reward[1] - EDGES.reward.fall_m[0]) / (1.0 - SAC.discount)
+    np.testing.assert_allclose(drawn.reward, kept.reward.at[1].set(expected), rtol=1e-5)
 
 
-def test_starts_turn_away_from_their_goals_bit_by_bit(roadmap):
-    sac = make(replace(TINY, iterations=10, turn_ramp=(0.2, 0.6)), ANT)
-    state = sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+def test_starts_turn_away_from_their_goals_bit_by_bit(train_tasks):
+    config = replace(with_sac(iterations=10), edges=replace(EDGES, turn_ramp=(0.2, 0.6)))
+    state = start(train_tasks, config, ANT)
     for iteration, share in ((0, 0.0), (2, 0.0), (4, 0.5), (8, 1.0)):
-        eased = sac._ease(state.replace(iteration=jnp.asarray(iteration)))
-        np.testing.assert_allclose(eased.env.info["tasks"].turn_rad, np.full(TINY.envs, np.pi * share), rtol=1e-6)
+        eased = state.task.ease(state.env, state.replace(iteration=jnp.asarray(iteration)).share)
+        np.testing.assert_allclose(eased.info["tasks"].turn_rad, np.full(SAC.envs, np.pi * share), rtol=1e-6)
 
 
-def test_in_a_share_of_the_environments_nothing_is_left_to_chance(roadmap):
-    greedy = make(replace(TINY, greedy=0.5, warmup=0))
-    state = greedy.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
+def test_in_a_share_of_the_environments_nothing_is_left_to_chance(train_tasks):
+    state = start(train_tasks, with_sac(greedy=0.5, warmup=0))
 
     def moved(key: int) -> np.ndarray:
-        after, _ = greedy._collect(state.replace(key=jax.random.key(key)))
+        after, _ = state.replace(key=jax.random.key(key)).collect()
         return np.asarray(after.env.obs["proprio"])  # pyright: ignore
 
     one, other = moved(1), moved(2)
@@ -295,31 +314,30 @@ def test_edges_in_a_row_end_with_the_first_that_is_not_walked(push, roadmap):
     assert share(push(0.0), edges=4) < 0.1
 
 
-def test_the_controller_is_the_policy_without_chance(sac, fresh):
-    act = SacController(fresh.normalizer, fresh.policy, 2, TINY.hidden)
+def test_the_controller_is_the_policy_without_chance(fresh):
+    act, learner = learned(fresh, TINY), fresh.learner
     proprio, goal = fresh.env.obs["proprio"], fresh.env.obs["goal"]
     action = act(proprio, goal)
-    assert action.shape == (TINY.envs, 2) and (np.abs(action) <= 1).all()
+    assert action.shape == (SAC.envs, 2) and (np.abs(action) <= 1).all()
     np.testing.assert_allclose(act(proprio[:1], goal[:1]), action[:1], atol=1e-6)
-    logits = sac.networks.policy_network.apply(fresh.normalizer, fresh.policy, jnp.concatenate([proprio, goal], -1))
+    seen = jnp.concatenate([proprio, goal], -1)
+    logits = learner.networks.policy_network.apply(learner.normalizer, learner.policy, seen)
     np.testing.assert_allclose(action, np.tanh(logits[:, :2]), atol=1e-6)
 
 
-def test_without_compilation(roadmap):
-    config = replace(TINY, envs=2, updates=1, warmup=1, batch=2, hidden=(4,), replay=8)
-    sac = make(config)
-    fresh = sac.create(jax.random.key(0), UMAZE, split_edges(roadmap, 0.2, 0)[0])
-    compiled, _ = sac.train(fresh, 2)
+def test_without_compilation(train_tasks):
+    begun = start(train_tasks, with_sac(envs=2, updates=1, warmup=1, batch=2, hidden=(4,), replay=8))
+    compiled, _ = begun.train(2)
     with jax.disable_jit():
-        plain, _ = sac.train(fresh, 2)
-    for a, b in zip(leaves(plain.policy), leaves(compiled.policy), strict=True):
+        plain, _ = begun.train(2)
+    for a, b in zip(leaves(plain.learner.policy), leaves(compiled.learner.policy), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_it_learns_to_walk(roadmap):
     """The umaze in half a minute or so."""
-    config = SacConfig(iterations=400, warmup=10, hidden=(64, 64), episode_steps=40)
+    config = ControllerConfig(SacConfig(iterations=400, warmup=10, hidden=(64, 64)), EdgeConfig(episode_steps=40))
     _, tested = train_controller(jax.random.key(0), ENV, UMAZE, roadmap, config)
     assert tested["held_out_success"] > 0.9 and tested["twenty_in_a_row"] > 0.8
 
@@ -329,11 +347,11 @@ def test_it_learns_to_walk(roadmap):
 
 def test_a_heading_is_asked_of_a_robot_that_has_one():
     with pytest.raises(UserError, match="'point' has no heading"):
-        make(replace(TINY, frame="heading"))
+        task_of(replace(TINY, augment=AugmentConfig(frame="heading")))
 
 
 def test_the_ants_controller_does_not_see_the_world_turn():
-    controller, group = blank_controller(ANT, "heading"), symmetries(ANT)
+    controller, group = untrained(ANT, "heading"), symmetries(ANT)
     proprio = MazeEnv(ANT, engine="mujoco", maps=False, maze=UMAZE).reset(jax.random.key(0)).obs["proprio"]
     goal = jnp.array([3.0, 1.0])
     turned = (np.linalg.det(group.world) > 0) & (group.action == np.eye(8)).all((1, 2))
@@ -345,17 +363,17 @@ def test_the_ants_controller_does_not_see_the_world_turn():
 
 
 @pytest.mark.parametrize("kind", ["velocity", "distance"])
-def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, roadmap):
+def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, train_tasks):
     """The same way through the world, another goal: what the reward, arrivals included, would have said of it."""
-    config = replace(TINY, envs=64, relabel=0.6, relabel_m=1.0)
-    sac = make(config, replace(POINT, controller_reward=kind))
-    state = sac.create(jax.random.key(1), UMAZE, split_edges(roadmap, 0.2, 0)[0]).env
-    after = jax.jit(jax.vmap(sac.env.step))(state, jnp.ones((64, 2)))
+    config = replace(with_sac(envs=64), edges=replace(EDGES, relabel=0.6, relabel_m=1.0))
+    begun = start(train_tasks, config, replace(POINT, controller_reward=kind), seed=1)
+    task, state = begun.task, begun.env
+    after = jax.jit(jax.vmap(task.env.step))(state, jnp.ones((64, 2)))
     over = (np.arange(64) % 4 == 0) | (np.asarray(after.done) > 0)
     seen = [jnp.concatenate([s.obs["proprio"], s.obs["goal"]], -1) for s in (state, after)]
     action = jnp.ones((64, 2))
-    batch = Transition(seen[0], action, jax.jit(sac._reward)(state, action, after), 1.0 - over, seen[1], {})
-    told = sac._relabel(batch, jax.random.key(0))
+    batch = Transition(seen[0], action, jax.jit(task.reward)(state, action, after), 1.0 - over, seen[1], {})
+    told = task.relabel(batch, jax.random.key(0))
     changed = np.asarray((told.observation != batch.observation).any(-1))
     assert not changed[over].any() and 0.4 < changed[~over].mean() < 0.8
     old, new = ((b.observation - b.next_observation)[:, -2:] for b in (batch, told))
@@ -367,52 +385,51 @@ def test_a_goal_drawn_afterwards_is_paid_as_if_it_had_been_there(kind, roadmap):
     arrived = left < POINT.goal_tolerance_m
     assert arrived.any() and not arrived.all() and before.max() <= 1.0
     dense = (before - left) / 0.1 if kind == "velocity" else -left
-    np.testing.assert_allclose(told.reward[changed], dense + config.arrival_bonus * arrived, atol=1e-3)
+    np.testing.assert_allclose(told.reward[changed], dense + EDGES.reward.arrival_bonus * arrived, atol=1e-3)
     np.testing.assert_array_equal(told.discount[changed], 1.0 - arrived)
 
 
 def test_through_an_arrival_the_value_goes_on():
     """To the goal after it, which is out of reach yet; only falls end it."""
-    config = replace(TINY, envs=64, relabel=0.6, relabel_m=1.0, chain=True, through=True)
-    sac = make(config)
+    config = with_edges(relabel=0.6, relabel_m=1.0, chain=True, through=True)
     at = jax.random.uniform(jax.random.key(0), (64, 2), minval=-0.3, maxval=0.3)
     seen, now = (jnp.concatenate([jnp.zeros((64, 2)), goal], -1) for goal in (at, at - 0.1))
     fall = (jnp.arange(64) % 4 == 0).astype(jnp.float32)
     arrived = (jnp.arange(64) % 4 == 1).astype(jnp.float32)
     batch = Transition(seen, jnp.zeros((64, 2)), jnp.zeros(64), 1.0 - fall - arrived, now,
                        {"state_extras": {"truncation": 0 * fall, "fall": fall}})  # fmt: skip
-    told = sac._present(batch, UMAZE, jax.random.key(1))
+    told = task_of(config).present(batch, UMAZE, jax.random.key(1), jnp.array(0.0))
     np.testing.assert_array_equal(told.discount, 1.0 - fall)
     changed = np.asarray((told.observation != batch.observation).any(-1))
     assert 0.15 < changed.mean() < 0.45 and not changed[np.asarray(fall + arrived) > 0].any()
     away = np.linalg.norm(told.next_observation[changed, -2:], axis=-1)
     assert away.min() >= POINT.goal_tolerance_m and (np.asarray(told.reward)[changed] > 9).any()  # the bonus of some
     with pytest.raises(UserError, match="set chain"):
-        replace(config, chain=False)
+        with_edges(through=True)
 
 
 def test_a_fall_costs_more_and_more():
-    config = replace(TINY, iterations=10, fall_m=(5.0, 60.0), fall_ramp=(0.2, 0.8), discount=0.9)
-    sac = make(config)
+    reward = task_of(with_edges(RewardConfig(fall_m=(5.0, 60.0), fall_ramp=(0.2, 0.8)))).reward
     batch = Transition(
         observation=jnp.zeros((2, 4)), action=jnp.zeros((2, 2)), reward=jnp.array([-3.0, -3.0]),
         discount=jnp.array([0.0, 1.0]), next_observation=jnp.zeros((2, 4)),
         extras={"state_extras": {"truncation": jnp.zeros(2), "fall": jnp.array([1.0, 0.0])}},
     )  # fmt: skip
-    for iteration, cost in ((0, 80.0), (5, 355.0), (9, 630.0)):
-        np.testing.assert_allclose(sac._pay_falls(batch, jnp.array(iteration)).reward, [-cost, -3.0], rtol=1e-5)
+    for share, cost in ((0.0, 80.0), (0.5, 355.0), (0.9, 630.0)):
+        paid = reward.pay_falls(batch, jnp.array(share), 0.9)
+        np.testing.assert_allclose(paid.reward, [-cost, -3.0], rtol=1e-5)
 
 
 def test_effort_limits_what_the_controller_asks_for():
-    full, gentle = (blank_controller(POINT, "world", action_scale=action_scale) for action_scale in (1.0, 0.25))
+    full, gentle = (untrained(POINT, "world", action_scale=action_scale) for action_scale in (1.0, 0.25))
     proprio, goal = jnp.ones((5, 2)), 10 * jnp.ones((5, 2))
     np.testing.assert_allclose(0.25 * full(proprio, goal), gentle(proprio, goal), rtol=1e-6)
+    config = with_sac(action_scale=0.5)
+    assert config.scaled(0.5).sac.action_scale == 0.25 and config.scaled(1.0) == config
 
 
-def blank_controller(robot, frame: str, action_scale: float = 1.0) -> SacController:
-    """An untrained controller."""
+def untrained(robot, frame: str, action_scale: float = 1.0) -> SacController:
+    """A controller as it begins."""
     env = MazeEnv(robot, engine="mujoco", maps=False)
-    size = input_size(env.proprio_size, frame)
-    policy = controller_networks(size, env.action_size, (16,)).policy_network.init(jax.random.key(3))
-    normalizer = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
-    return SacController(normalizer, policy, env.action_size, (16,), frame, action_scale)
+    config = ControllerConfig(SacConfig(hidden=(16,), action_scale=action_scale), augment=AugmentConfig(frame=frame))
+    return blank_controller(jax.random.key(3), env.proprio_size, env.action_size, config)

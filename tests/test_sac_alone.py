@@ -7,55 +7,57 @@ import jax
 import numpy as np
 import pytest
 
-from ct_envs import POINT, MazeEnv, UserError, load_maze
+from ct_envs import POINT, MazeEnv, load_maze
 from ct_envs.occupancy import local_map
-from ct_jax.baselines.sac_alone import SacAlone, train_sac_alone
+from ct_jax.baselines.sac_alone import SacAloneConfig, start_training, train_sac_alone
 from ct_jax.checkpoint import Checkpoints
+from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import Pairs, evaluate
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's replay
 
 UMAZE = load_maze("antmaze-umaze")
-TINY = SacConfig(envs=4, iterations=6, updates=2, warmup=2, batch=8, hidden=(8,), replay=64, discount=0.9)
+SAC = SacConfig(envs=4, iterations=6, updates=2, warmup=2, batch=8, hidden=(8,), replay=64, discount=0.9)
+TINY = SacAloneConfig(SAC)
 SHORT = replace(POINT, horizon=5)
 ENV = functools.partial(MazeEnv, SHORT, engine="mujoco", map_cell_m=0.7)
 
 
-@pytest.fixture(scope="module")
-def learner():
-    return SacAlone(ENV(maps=False), TINY)
+def start(config: SacAloneConfig = TINY) -> OffPolicy:
+    return start_training(jax.random.key(0), ENV(maps=False), UMAZE, config)
 
 
 @pytest.fixture(scope="module")
-def fresh(learner):
-    return learner.create(jax.random.key(0), UMAZE, None)
+def fresh():
+    return start()
 
 
 def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-def test_a_few_iterations(learner, fresh):
+def test_a_few_iterations(fresh):
     """Nothing is learned in the warm-up; afterwards everything moves, and stays finite."""
-    warm, _ = learner.train(fresh, 2)
-    assert same(warm.policy, fresh.policy) and same(warm.critic, fresh.critic)
-    state, metrics = learner.train(warm, 2)
+    warm, _ = fresh.train(2)
+    assert same(warm.learner.policy, fresh.learner.policy) and same(warm.learner.critic, fresh.learner.critic)
+    state, metrics = warm.train(2)
     for name in ("policy", "critic", "target_critic"):
-        assert not same(getattr(state, name), getattr(warm, name)), name
+        assert not same(getattr(state.learner, name), getattr(warm.learner, name)), name
     assert np.isfinite([float(value) for value in metrics.values()]).all()
 
 
 def test_its_critics_have_the_controllers_norm(fresh):
-    normed = SacAlone(ENV(maps=False), replace(TINY, critic_norm=True)).create(jax.random.key(0), UMAZE, None)
+    normed = start(replace(TINY, sac=replace(SAC, critic_norm=True))).learner
     found = ["LayerNorm" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(normed.critic)]
     assert any(found) and not all(found)
-    assert not any("LayerNorm" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(fresh.critic))
+    plain = jax.tree.leaves_with_path(fresh.learner.critic)
+    assert not any("LayerNorm" in jax.tree_util.keystr(path) for path, _ in plain)
 
 
-def test_maps_are_recomputed_as_they_were(learner, fresh):
+def test_maps_are_recomputed_as_they_were(fresh):
     """From what the replay keeps, the networks see what an environment with maps shows."""
-    inputs = learner._see(learner._observe(fresh.env), UMAZE)
+    inputs = fresh.task.inputs(fresh.task.observe(fresh.env), UMAZE)
     info = fresh.env.info
     shown = jax.vmap(lambda at, to: local_map(UMAZE, at, to, cell_m=0.7))(info["position"], info["goal"])
     np.testing.assert_array_equal(inputs.map[:, 0], shown[:, 0])
@@ -65,16 +67,16 @@ def test_maps_are_recomputed_as_they_were(learner, fresh):
     assert 0 < np.mean(inputs.map[:, 0]) < 1
 
 
-def test_the_task_is_the_maze(learner, fresh, wall_distance):
+def test_the_task_is_the_maze(fresh, wall_distance):
     """Fresh starts and goals anywhere, every time an episode of the robot's horizon is over; minus the distance."""
     starts, state = [], fresh
-    collect = jax.jit(learner._collect)
+    collect = jax.jit(OffPolicy.collect)
     for _ in range(16):
         before = state
         state, _ = collect(state)
-        reward = learner._buffer._unflatten_fn(state.replay.data).reward[: int(state.replay.insert_position)][-4:]
+        reward = state.buffer._unflatten_fn(state.replay.data).reward[: int(state.replay.insert_position)][-4:]
         won = np.asarray(state.env.info["success"] * state.env.done) > 0
-        np.testing.assert_allclose(reward, state.env.reward + TINY.arrival_bonus * won, rtol=1e-6)
+        np.testing.assert_allclose(reward, state.env.reward + TINY.reward.arrival_bonus * won, rtol=1e-6)
         over = np.asarray(state.env.done) > 0
         assert (np.asarray(before.env.info["episode_steps"])[over & ~won] == 4).all()
         starts += list(np.asarray(state.env.info["position"])[over])
@@ -117,15 +119,9 @@ def test_the_policy_can_be_evaluated(whole):
     assert (once.returns < 0).all()
 
 
-@pytest.mark.parametrize("wrong", [{"mirror": True}, {"chain": True}])
-def test_what_it_cannot_do_is_an_error(wrong):
-    with pytest.raises(UserError, match="SAC alone"):
-        SacAlone(ENV(maps=False), replace(TINY, **wrong))
-
-
-def test_without_compilation(learner, fresh):
-    warm, _ = learner.train(fresh, 2)
+def test_without_compilation(fresh):
+    warm, _ = fresh.train(2)
     with jax.disable_jit():
-        state, _ = learner._updates(learner._collect(warm)[0])
-    assert not same(state.policy, warm.policy)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.policy, state.critic)))
+        state, _ = warm.collect()[0].learn()
+    assert not same(state.learner.policy, warm.learner.policy)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.learner.policy, state.learner.critic)))

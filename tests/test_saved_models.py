@@ -16,6 +16,10 @@ from safetensors.numpy import save_file
 
 from ct_envs import UserError
 from ct_jax.checkpoint import _sum_of_arrays, load_weights, save_weights
+from ct_jax.controller import ControllerConfig
+from ct_jax.controllers.augment import AugmentConfig
+from ct_jax.controllers.edges import EdgeConfig
+from ct_jax.controllers.reward import RewardConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.fit import ValueConfig
 from ct_jax.model import (
@@ -28,7 +32,7 @@ from ct_jax.model import (
     save_model,
     zoo_names,
 )
-from ct_jax.settings import Settings, from_dict, to_dict
+from ct_jax.settings import Settings, controller_config, from_dict, to_dict
 from ct_jax.transformer import ModelConfig
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
@@ -169,7 +173,7 @@ def trained():
 def folder(trained, tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     save_model(folder, trained)
-    save_controller(folder / "controller", "point", SETTINGS.sac, trained.controller, {"seed": 0})
+    save_controller(folder / "controller", "point", controller_config(SETTINGS), trained.controller, {"seed": 0})
     return folder
 
 
@@ -200,13 +204,13 @@ def test_mutated_model_description_is_error_or_equivalent(folder, model_json, tr
 @examples(400)
 def test_mutated_controller_description_is_error_or_equivalent(folder, trained, data):
     place = folder / "controller"
-    save_controller(place, "point", SETTINGS.sac, trained.controller, {"seed": 0})
+    save_controller(place, "point", controller_config(SETTINGS), trained.controller, {"seed": 0})
     described = json.loads((place / "controller.json").read_text())
     (place / "controller.json").write_text(json.dumps(data.draw(mutated(described))))
     found = []
     if not refused(lambda: found.append(load_controller(str(place), "point"))):
         controller, config = found[0]
-        assert config == SETTINGS.sac
+        assert config == controller_config(SETTINGS)
         jax.tree.map(np.testing.assert_array_equal, controller, trained.controller)
 
 
@@ -248,11 +252,35 @@ def test_files_of_earlier_versions_are_read(folder, trained, model_json):
     assert_same_model(load_model(str(folder)), trained)
 
 
-@pytest.mark.parametrize("number", [0, 4, 99, None, "2", 2.0, True])
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_controllers_that_earlier_versions_wrote_are_read(trained, tmp_path, number):
+    """Their settings were one object, and were bound to the weights as they stood in the file."""
+    flat = {"hidden": [8, 4], "iterations": 7, "fall_m": [1.0, 2.0], "relabel": 0.5, "mirror": True}
+    flat |= {"effort": 0.5} if number < 3 else {"action_scale": 0.5}
+    said = {"robot": "point", "sac": flat}
+    save_weights(tmp_path / "weights.safetensors", trained.controller, of=said if number > 1 else None)
+    described = said | {"proprio": 2, "actions": 2, "format": number, "made": {}}
+    (tmp_path / "controller.json").write_text(json.dumps(described))
+    found, config = load_controller(str(tmp_path), "point")
+    assert config == ControllerConfig(
+        SacConfig(hidden=(8, 4), iterations=7, action_scale=0.5),
+        EdgeConfig(reward=RewardConfig(fall_m=(1.0, 2.0)), relabel=0.5),
+        AugmentConfig(mirror=True),
+    )
+    assert found.action_scale == 0.5
+    jax.tree.map(np.testing.assert_array_equal, found.policy, trained.controller.policy)
+    if number > 1:
+        described["sac"]["mirror"] = False
+        (tmp_path / "controller.json").write_text(json.dumps(described))
+        with pytest.raises(UserError, match="weights of another model"):
+            load_controller(str(tmp_path), "point")
+
+
+@pytest.mark.parametrize("number", [0, 5, 99, None, "2", 2.0, True])
 def test_unknown_format_is_error_with_known_formats(folder, trained, model_json, number):
     save_model(folder, trained)
     (folder / "model.json").write_text(json.dumps(model_json | {"format": number}))
-    with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 to 3"):
+    with pytest.raises(UserError, match=r"model\.json: of format .*; this version of ct-jax reads 1 to 4"):
         load_model(str(folder))
 
 

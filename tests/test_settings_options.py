@@ -7,7 +7,7 @@ import pytest
 
 from ct_envs import UserError
 from ct_jax import cli, pipeline
-from ct_jax.presets import get_preset
+from ct_jax.configs import get_preset
 from ct_jax.settings import Settings, to_dict
 
 

@@ -11,10 +11,10 @@ import ct_jax
 ROOT = Path(__file__).parents[1]
 # The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here.
 ORDER = [
-    *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "progress"],
+    *["numerics", "files", "terminal", "compilation", "interrupts", "devices", "checkpoint", "learner", "progress"],
     *["types", "prm", "guides", "pairs", "trajectories", "guided", "collect"],
-    *["controllers", "dense", "transformer", "value", "fit", "policy", "agent", "evaluate", "finetune"],
-    *["baselines", "transfer", "settings", "presets", "model", "run"],
+    *["controllers", "controller", "dense", "transformer", "heads", "value", "fit", "policy", "agent", "evaluate"],
+    *["finetune", "baselines", "transfer", "settings", "configs", "model", "run"],
     *["report", "worlds", "pipeline", "cli"],
 ]
 # What steps robots, and the worlds that hold it.

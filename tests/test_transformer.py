@@ -11,10 +11,11 @@ from brax.training.acme import running_statistics, specs
 
 from ct_envs import UserError
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.controllers.sac import SacConfig, SacController, controller_networks
+from ct_jax.controller import ControllerConfig, make_controller
+from ct_jax.controllers.sac import SacConfig, make_networks
+from ct_jax.heads import HeadingHead, make_head, with_skill
 from ct_jax.transformer import (
     ControlTransformer,
-    HeadingHead,
     MapEncoder,
     ModelConfig,
     Modes,
@@ -22,7 +23,6 @@ from ct_jax.transformer import (
     empty_cache,
     empty_history,
     sample_inputs,
-    with_skill,
 )
 
 P, A = 3, 2
@@ -202,12 +202,13 @@ def propose(model, params, inputs) -> Modes:
 
 def skilled(**changes):
     """A model whose head is a controller, its parameters, and the controller."""
-    sac = SacConfig(hidden=(8, 8), action_scale=0.5)
+    config = ControllerConfig(SacConfig(hidden=(8, 8), action_scale=0.5))
     normalizer = running_statistics.init_state(specs.Array((P + 2,), jnp.dtype("float32")))
     normalizer = normalizer.replace(mean=jnp.arange(P + 2.0) / 5, std=1.0 + jnp.arange(P + 2.0))
-    policy = controller_networks(P + 2, A, sac.hidden).policy_network.init(jax.random.key(3))
-    controller = SacController(normalizer, policy, A, sac.hidden, sac.frame, sac.action_scale)
-    model = ControlTransformer(replace(TINY, skill=True, **changes), A, sac)
+    policy = make_networks(P + 2, A, config.sac.hidden).policy_network.init(jax.random.key(3))
+    controller = make_controller(normalizer, policy, A, config)
+    sizes = replace(TINY, skill=True, **changes)
+    model = ControlTransformer(sizes, A, make_head(sizes, A, config))
     params = jax.jit(model.init)(jax.random.key(0), *sample_inputs(P, A))
     return model, with_skill(params, controller), controller
 

@@ -51,7 +51,8 @@ def test_loss_is_squared_error_of_undiscounted_return():
     valid = (jnp.arange(8) < 6).astype(jnp.float32)[:, None]
     value = apply(PARAMS, *inputs)
     expected = np.mean(((value - rtg) / RETURN_DIVISOR)[:6] ** 2)
-    loss = jax.jit(value_loss(MODEL))
+    of_value = value_loss(MODEL)
+    loss = jax.jit(lambda *inputs: of_value(*inputs)[0])
     key = jax.random.key(0)
     np.testing.assert_allclose(loss(PARAMS, window(*inputs, rtg, valid), key), expected, rtol=1e-5)
     np.testing.assert_allclose(loss(PARAMS, window(*inputs, value), key), 0.0, atol=1e-9)
@@ -73,7 +74,8 @@ def test_value_learns_mean_return():
     def learn(params):
         def step(carry, _):
             params, state = carry
-            change, state = optimizer.update(jax.grad(loss)(params, data, jax.random.key(0)), state)
+            gradient, _ = jax.grad(loss, has_aux=True)(params, data, jax.random.key(0))
+            change, state = optimizer.update(gradient, state)
             return (optax.apply_updates(params, change), state), None
 
         return jax.lax.scan(step, (params, optimizer.init(params)), length=300)[0][0]

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ct_envs import Robot
@@ -27,8 +28,9 @@ from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.frames import FrameName, symmetries
 from ct_envs.maze import Maze
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
-from ct_jax.checkpoint import Checkpoints, run_to
+from ct_jax.checkpoint import Checkpoints
 from ct_jax.devices import data_mesh, place, replicated, sharded
+from ct_jax.learner import Info, learn
 from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
 
 
@@ -68,17 +70,6 @@ class Learned:
 
 
 @struct.dataclass
-class CqlState:
-    """The complete state of training, from which it can continue."""
-
-    params: Learned
-    target: Any  # target critics: a moving average of the critics
-    optimizer: Any
-    key: jax.Array
-    update: jax.Array
-
-
-@struct.dataclass
 class Transitions:
     """Single steps of trajectories, with the observations before and after."""
 
@@ -102,61 +93,78 @@ def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
     return Transitions(see(0), window.action[:, 0], reward, see(1), arrived, known)
 
 
+@struct.dataclass
 class Cql:
-    """The learner: ``create`` and ``train`` on states, both pure."""
+    """The learner: its settings, and after ``create`` the complete state of training."""
 
-    def __init__(self, config: CqlConfig, map_cell_m: float, robot: Robot, action_size: int):
-        self.config, self.map_cell_m, self.robot, self.action_size = config, map_cell_m, robot, action_size
-        self.actor, self.critics = Actor(action_size, config.width, config.frame), Critics(config.width, config.frame)
-        self.distribution = tanh_gaussian(action_size)
-        self.optimizer = optax.adam(config.learning_rate)
-        self.mesh = data_mesh(config.batch)
-        self._symmetries = symmetries(robot) if config.mirror else None
-        self.train = jax.jit(self._train, static_argnames="updates")
+    config: CqlConfig = struct.field(pytree_node=False)
+    map_cell_m: float = struct.field(pytree_node=False)
+    robot: Robot = struct.field(pytree_node=False)
+    action_size: int = struct.field(pytree_node=False)
+    params: Learned | None = None
+    target: Any = None  # target critics: a moving average of the critics
+    optimizer: Any = None
+    key: Any = None
+    step: Any = None  # updates so far
 
-    def create(self, key: jax.Array, data: Trajectories) -> CqlState:
-        """The state before training on data of these sizes, replicated over the devices."""
+    def create(self, key: jax.Array, data: Trajectories) -> "Cql":
+        """The learner before training on data of these sizes, replicated over the devices."""
         actor_key, critic_key, key = jax.random.split(key, 3)
         see = sample_seen(data.proprio.shape[-1])
         actor = jax.jit(self.actor.init)(actor_key, see)
         critics = jax.jit(self.critics.init)(critic_key, see, jnp.zeros((1, 1, self.action_size)))
         params = Learned(actor, critics, jnp.log(jnp.asarray(self.config.temperature, jnp.float32)))
-        state = CqlState(params, critics, self.optimizer.init(params), key, jnp.zeros((), jnp.int32))
-        return place(jax.tree.map(jnp.array, state), replicated(self.mesh))
+        fresh = self.replace(
+            params=params, target=critics, optimizer=self._adam.init(params), key=key, step=jnp.zeros((), jnp.int32)
+        )
+        return place(jax.tree.map(jnp.array, fresh), replicated(self.mesh))
 
-    def policy(self, state: CqlState) -> ActorPolicy:
-        """The policy in this state."""
-        return ActorPolicy(state.params.actor, self.action_size, self.config.width, self.config.frame)
-
-    def _train(
-        self, state: CqlState, data: Trajectories, mazes: Maze, updates: int
-    ) -> tuple[CqlState, dict[str, jax.Array]]:
-        """Run ``updates`` updates (static); returns the state and mean metrics."""
-        state, info = jax.lax.scan(lambda s, _: self._update(s, data, mazes), state, length=updates)
-        return state, jax.tree.map(jnp.mean, info)
-
-    def _update(self, state: CqlState, data: Trajectories, mazes: Maze) -> tuple[CqlState, dict[str, jax.Array]]:
-        draw, noise = jax.random.split(jax.random.fold_in(state.key, state.update))
+    def update(self, data: Trajectories, mazes: Maze) -> tuple["Cql", Info]:
+        """One update on a batch of single steps."""
+        draw, noise = jax.random.split(jax.random.fold_in(self.key, self.step))
         window = sample_windows(
             draw, data, data.reward, mazes, batch=self.config.batch, steps=2, overhang=1, map_cell_m=self.map_cell_m,
-            symmetries=self._symmetries,
+            symmetries=symmetries(self.robot) if self.config.mirror else None,
         )  # fmt: skip
         window = jax.lax.with_sharding_constraint(window, sharded(self.mesh))
         batch = transitions(window, self.robot.goal_tolerance_m)
-        gradient, info = jax.grad(self._loss, has_aux=True)(state.params, state, batch, noise)
-        change, optimizer = self.optimizer.update(gradient, state.optimizer, state.params)
-        params: Any = optax.apply_updates(state.params, change)
-        target = optax.incremental_update(params.critics, state.target, self.config.target_rate)
-        return CqlState(params, target, optimizer, state.key, state.update + 1), info
+        gradient, info = jax.grad(self.loss, has_aux=True)(self.params, batch, noise)
+        change, optimizer = self._adam.update(gradient, self.optimizer, self.params)
+        params: Any = optax.apply_updates(self.params, change)
+        target = optax.incremental_update(params.critics, self.target, self.config.target_rate)
+        return self.replace(params=params, target=target, optimizer=optimizer, step=self.step + 1), info
 
-    def _loss(
-        self, params: Learned, state: CqlState, batch: Transitions, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+    @property
+    def _adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.config.learning_rate)
+
+    @property
+    def mesh(self) -> Mesh:
+        """The devices that share a batch."""
+        return data_mesh(self.config.batch)
+
+    @property
+    def actor(self) -> Actor:
+        """The policy's network."""
+        return Actor(self.action_size, self.config.width, self.config.frame)
+
+    @property
+    def critics(self) -> Critics:
+        """The critics' network."""
+        return Critics(self.config.width, self.config.frame)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """What is learned so far."""
+        assert self.params is not None
+        return ActorPolicy(self.params.actor, self.action_size, self.config.width, self.config.frame)
+
+    def loss(self, params: Learned, batch: Transitions, key: jax.Array) -> tuple[jax.Array, Info]:
         """The sum of the losses. The gradient of each changes only its own parameters."""
         critic_key, actor_key = jax.random.split(key)
         mean = lambda values: jnp.sum(values * batch.known) / jnp.maximum(jnp.sum(batch.known), 1.0)  # noqa: E731
-        error, gap, q = self._critic_losses(params, state.target, batch, critic_key)
-        actor, entropy = self._actor_loss(params, state.update, batch, actor_key)
+        error, gap, q = self._critic_losses(params, self.target, batch, critic_key)
+        actor, entropy = self._actor_loss(params, self.step, batch, actor_key)
         surplus = jax.lax.stop_gradient(entropy) - self.config.entropy * self.action_size
         losses = {"error": mean(error), "gap": mean(gap), "actor_loss": mean(actor)}
         loss = losses["error"] + self.config.alpha * losses["gap"] + losses["actor_loss"]
@@ -201,17 +209,18 @@ class Cql:
         value = self.critics.apply(critics, batch.now, action).min(-1)[:, 0]  # pyright: ignore
         if self.config.imitation:
             # The inverse of tanh is infinite at the bounds, so clip the actions.
-            done = self.distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
-            value = jnp.where(update < self.config.imitation, self.distribution.log_prob(logits, done), value)
+            distribution = tanh_gaussian(self.action_size)
+            done = distribution.inverse_postprocess(jnp.clip(batch.action, -0.999, 0.999))
+            value = jnp.where(update < self.config.imitation, distribution.log_prob(logits, done), value)
         return temperature * log_density[:, 0] - value, -log_density[:, 0]
 
     def _draw(
         self, key: jax.Array, logits: Float[Array, "B 2A"], n: int
     ) -> tuple[Float[Array, "B n A"], Float[Array, "B n"]]:
         """n actions of the policy, and their log-densities."""
-        logits = jnp.repeat(logits[:, None], n, 1)
-        raw = self.distribution.sample_no_postprocessing(logits, key)
-        return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
+        distribution, logits = tanh_gaussian(self.action_size), jnp.repeat(logits[:, None], n, 1)
+        raw = distribution.sample_no_postprocessing(logits, key)
+        return distribution.postprocess(raw), distribution.log_prob(logits, raw)
 
 
 def train_cql(
@@ -232,12 +241,9 @@ def train_cql(
         on_progress: called with (updates done, metrics) after every ``chunk``.
         checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
-    state = learner.create(key, data)
+    learner = learner.create(key, data)
     data, mazes = place((data, mazes), replicated(learner.mesh))
-    state = run_to(
-        learner.config.updates, state, lambda state, n: learner.train(state, data, mazes, n),
-        lambda state: int(state.update),
-        on_progress,
-        checkpoints, chunk,
-    )  # fmt: skip
-    return jax.device_get(learner.policy(state))
+    learner = learn(
+        learner, learner.config.updates, data, mazes, on_progress=on_progress, checkpoints=checkpoints, chunk=chunk
+    )
+    return jax.device_get(learner.policy)

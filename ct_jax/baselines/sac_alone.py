@@ -5,88 +5,136 @@ the goal, and an episode has the robot's full horizon. The replay buffer keeps p
 them, exactly, when a batch is drawn.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.networks import FeedForwardNetwork
+from brax.training.types import Transition
 from jaxtyping import Array, Float
 
-from ct_envs import MazeEnv, UserError
+from ct_envs import MazeEnv
+from ct_envs.checked import Checked
+from ct_envs.frames import FrameName
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
 from ct_jax.checkpoint import Checkpoints, run_to
-from ct_jax.controllers.sac import Sac, SacConfig
+from ct_jax.controllers.augment import check_frame
+from ct_jax.controllers.off_policy import OffPolicy
+from ct_jax.controllers.reward import Reward, RewardConfig
+from ct_jax.controllers.sac import SacConfig
 
-# Settings of ``SacConfig`` that apply only to training on edges, and the values that they must have here.
-EDGES_ONLY: dict[str, Any] = {"chain": False, "through": False, "turn_ramp": None, "mirror": False, "relabel": 0.0}
+
+@dataclass(frozen=True)
+class SacAloneConfig(Checked):
+    """Settings of SAC alone."""
+
+    sac: SacConfig = SacConfig()  # ``hidden[0]`` is the width of its networks
+    reward: RewardConfig = RewardConfig()
+    frame: FrameName = "world"  # "heading": proprioception and actions are in the robot's own frame
 
 
-class SacAlone(Sac):
-    """The learner: ``Sac`` with local maps. ``hidden[0]`` is the width of its networks."""
+@functools.cache  # learners with the same networks share their compiled programs
+def _make_networks(
+    proprio_size: int, action_size: int, width: int, frame: FrameName, critic_norm: bool
+) -> sac_networks.SACNetworks:
+    actor, critics = Actor(action_size, width, frame), Critics(width, frame, critic_norm)
+    policy = FeedForwardNetwork(
+        init=lambda key: actor.init(key, sample_seen(proprio_size)),
+        apply=lambda normalizer, params, seen: actor.apply(params, seen),
+    )
+    critic = FeedForwardNetwork(
+        init=lambda key: critics.init(key, sample_seen(proprio_size), jnp.zeros((1, 1, action_size))),
+        apply=lambda normalizer, params, seen, action: critics.apply(params, seen, action[:, None])[:, 0],  # pyright: ignore
+    )
+    return sac_networks.SACNetworks(policy, critic, tanh_gaussian(action_size))  # pyright: ignore[reportCallIssue]
 
-    kept = 4
 
-    def __init__(self, env: MazeEnv, config: SacConfig):
-        set_to = {name: value for name, value in EDGES_ONLY.items() if getattr(config, name) != value}
-        if set_to:
-            hint = ", ".join(f"{name}={value}" for name, value in set_to.items())
-            raise UserError(f"SAC alone has no edges, so some settings of SacConfig do not apply; set {hint}")
-        super().__init__(env, config)
-        self.reward = "distance"
+@dataclass(frozen=True)
+class MazeTask:
+    """Crossing the maze: an ``off_policy.Task``."""
 
-    def _make_networks(self) -> sac_networks.SACNetworks:
-        size, width, frame = self.env.action_size, self.config.hidden[0], self.config.frame
-        actor, critics = Actor(size, width, frame), Critics(width, frame, self.config.critic_norm)
-        see = sample_seen(self.env.proprio_size)
-        policy = FeedForwardNetwork(
-            init=lambda key: actor.init(key, see),
-            apply=lambda normalizer, params, seen: actor.apply(params, seen),
-        )
-        critic = FeedForwardNetwork(
-            init=lambda key: critics.init(key, see, jnp.zeros((1, 1, size))),
-            apply=lambda normalizer, params, seen, action: critics.apply(params, seen, action[:, None])[:, 0],  # pyright: ignore
-        )
-        return sac_networks.SACNetworks(policy, critic, tanh_gaussian(size))  # pyright: ignore[reportCallIssue]
+    env: MazeEnv  # with auto-reset and without maps
+    reward_config: RewardConfig
+    frame: FrameName
+    discount: float
 
-    def _observe(self, state: State) -> Float[Array, "N P+4"]:
-        return jnp.concatenate([super()._observe(state), state.info["position"]], -1)
+    def __post_init__(self) -> None:
+        check_frame(self.frame, self.env.robot)
 
-    def _see(self, observation: Float[Array, "N P+4"], maze: Maze) -> Seen:
+    @property
+    def reward(self) -> Reward:
+        """Minus the distance to the goal, with bonuses and costs."""
+        return Reward(self.reward_config, "distance", self.env.robot.control_dt_s)
+
+    @property
+    def observation_size(self) -> int:
+        """Of proprioception, goal and position."""
+        return self.env.proprio_size + 4
+
+    @property
+    def input_size(self) -> None:
+        """These networks scale their inputs themselves, as the transformer does."""
+        return None
+
+    def networks(self, config: SacConfig) -> sac_networks.SACNetworks:
+        """The baselines' actor and critics."""
+        sizes = self.env.proprio_size, self.env.action_size
+        return _make_networks(*sizes, config.hidden[0], self.frame, config.critic_norm)
+
+    def observe(self, state: State) -> Float[Array, "N P+4"]:
+        """Proprioception, the vector to the goal, and the position."""
+        return jnp.concatenate([state.obs["proprio"], state.obs["goal"], state.info["position"]], -1)  # pyright: ignore
+
+    def inputs(self, observation: Float[Array, "N P+4"], maze: Maze) -> Seen:
+        """The same with the local map for the position."""
         proprio, goal, position = observation[:, :-4], observation[:, -4:-2], observation[:, -2:]
         see = jax.vmap(lambda at, to: local_map(maze, at, to, cell_m=self.env.map_cell_m))
         return Seen(see(position, position + goal), proprio, goal)
 
-    def _watch(self, normalizer: Any, inputs: Seen) -> Any:
-        return normalizer  # not used: these networks scale their inputs themselves, as the transformer does
+    def ease(self, state: State, share: Float[Array, ""]) -> State:
+        """The state as it is: starts are as hard from the first."""
+        del share
+        return state
+
+    def present(self, batch: Transition, maze: Maze, key: jax.Array, share: Float[Array, ""]) -> Transition:
+        """A batch from the replay, as inputs of the networks, with the cost of falls."""
+        del key
+        now, after = (self.inputs(seen, maze) for seen in (batch.observation, batch.next_observation))
+        return self.reward.pay_falls(batch._replace(observation=now, next_observation=after), share, self.discount)
+
+
+def start_training(key: jax.Array, env: MazeEnv, maze: Maze, config: SacAloneConfig) -> OffPolicy:
+    """The training before its first iteration. ``env`` must have auto-reset, and no maps."""
+    task = MazeTask(env, config.reward, config.frame, config.sac.discount)
+    return OffPolicy(config.sac, task).create(key, maze, None)
 
 
 def train_sac_alone(
     key: jax.Array,
     env_factory: Callable[..., MazeEnv],
     maze: Maze,
-    config: SacConfig,
+    config: SacAloneConfig,
     *,
     on_progress: Callable[[int, dict[str, float]], None] = lambda iteration, metrics: None,
     checkpoints: Checkpoints | None = None,
     chunk: int = 25,
 ) -> ActorPolicy:
-    """Learn to reach goals anywhere in a maze; ``config.episode_steps`` and ``held_out`` are not used.
+    """Learn to reach goals anywhere in a maze.
 
     Args:
         env_factory: makes the robot's ``MazeEnv`` from keyword arguments.
         on_progress: called with (iterations done, metrics) after every ``chunk`` iterations.
         checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
-    env = env_factory(maps=False)
-    sac = SacAlone(env, config)
+    env, sac = env_factory(maps=False), config.sac
     state = run_to(
-        config.iterations, sac.create(key, maze, None), sac.train, lambda state: int(state.iteration),
-        on_progress,
-        checkpoints, chunk,
+        sac.iterations, start_training(key, env, maze, config), OffPolicy.train, lambda state: int(state.iteration),
+        on_progress, checkpoints, chunk,
     )  # fmt: skip
-    return ActorPolicy(jax.device_get(state.average), env.action_size, config.hidden[0], config.frame)
+    return ActorPolicy(jax.device_get(state.learner.average), env.action_size, sac.hidden[0], config.frame)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ct_envs.maze import Maze, unpadded
 from ct_envs.robots import get_robot
 from ct_jax import devices
 from ct_jax.checkpoint import read_json, write_json
-from ct_jax.controllers.sac import SacConfig, SacController, train_controller
+from ct_jax.controller import ControllerConfig, SacController, train_controller
 from ct_jax.evaluate import Episodes, check_horizon
 from ct_jax.files import check_writable, save_arrays
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
@@ -22,7 +22,7 @@ from ct_jax.pairs import Pairs, horizon_for
 from ct_jax.prm import Roadmap, build_roadmap
 from ct_jax.progress import Metrics
 from ct_jax.run import Run, join_mazes, slug, training
-from ct_jax.settings import MAX_EPISODES
+from ct_jax.settings import MAX_EPISODES, controller_config
 from ct_jax.worlds import Trial
 from ct_jax.worlds.mazes import MazeWorld
 
@@ -47,15 +47,15 @@ def open_training(run: Run, *, maps: bool) -> Iterator[MazeWorld]:
 # ------------------------------------------------------------------------------------------------------ controller
 
 
-def controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
+def controller(run: Run, metrics: Metrics) -> tuple[SacController, ControllerConfig]:
     """The run's own controller, learned or copied once from where it was given, and its configuration."""
     learned, config = _controller(run, metrics)
-    scale = run.settings.controller_action_scale * config.action_scale
-    return learned.replace(action_scale=scale), replace(config, action_scale=scale)
+    config = config.scaled(run.settings.controller_action_scale)
+    return learned.replace(action_scale=config.sac.action_scale), config
 
 
-def _controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
-    config = run.settings.sac
+def _controller(run: Run, metrics: Metrics) -> tuple[SacController, ControllerConfig]:
+    config = controller_config(run.settings)
     if run.done("controller") is not None:
         return load_controller(str(run.folder), run.robot, hint=run.hint("controller"))
     if run.settings.controller != "own":  # a copy: later changes at the source do not affect this run
@@ -65,7 +65,7 @@ def _controller(run: Run, metrics: Metrics) -> tuple[SacController, SacConfig]:
         return load_controller(str(run.folder), run.robot)
     roadmap = _roadmap(run)
     with run.stage("controller") as (folder, info):
-        with training(folder, "controller", config.iterations, metrics) as watch:
+        with training(folder, "controller", config.sac.iterations, metrics) as watch:
             make = lambda **options: make_env(run, **options)  # noqa: E731
             learned, tested = train_controller(run.key("controller"), make, roadmap.maze, roadmap, config, **watch)
         devices.first(lambda: save_controller(folder, run.robot, config, learned, run.made | tested))

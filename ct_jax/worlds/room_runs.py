@@ -15,14 +15,14 @@ from ct_envs.turtlebot3 import MAX_NOISE
 from ct_envs.turtlebot3_world import World as Room
 from ct_envs.turtlebot3_world import load_world
 from ct_jax.checkpoint import write_json
+from ct_jax.controller import ControllerConfig
 from ct_jax.controllers.differential_drive import DifferentialDrive
-from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import Episodes, check_horizon
 from ct_jax.model import TrainedModel
 from ct_jax.pairs import Pairs, horizon_for
 from ct_jax.progress import Metrics
 from ct_jax.run import Run, cores
-from ct_jax.settings import MAX_FACTOR, MAX_WORLDS, RoomConfig
+from ct_jax.settings import MAX_FACTOR, MAX_WORLDS, RoomConfig, controller_config
 from ct_jax.worlds import Trial
 from ct_jax.worlds.rooms import PLANNER, RoomWorld, evaluation_rooms
 
@@ -44,10 +44,10 @@ def open_training(run: Run, *, maps: bool) -> Iterator[RoomWorld]:
         yield world
 
 
-def controller(run: Run, metrics: Metrics) -> tuple[DifferentialDrive, SacConfig]:
+def controller(run: Run, metrics: Metrics) -> tuple[DifferentialDrive, ControllerConfig]:
     """The known controller (paper, sec. IV-B)."""
     del metrics
-    return DifferentialDrive(), run.settings.sac
+    return DifferentialDrive(), controller_config(run.settings)
 
 
 def trials(run: Run, folder: Path) -> Iterator[Trial]:

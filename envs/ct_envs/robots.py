@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
+from typing import Literal
 
 from ct_envs.checked import shown
 from ct_envs.errors import UserError
@@ -12,7 +14,7 @@ class Robot:
     """The data of a robot besides its model file. SI units."""
 
     name: str
-    xml: str  # file in assets/
+    xml: str  # file in assets/, or the absolute path of another
     radius_m: float  # radius of an upright cylinder around the robot, for the clearance of roadmaps
     touch_m: float  # maximum distance of any part from the centre, for the search of the nearest walls
     top_speed_mps: float  # upper limit of the speed, so that no wall is missed in a control step
@@ -25,9 +27,9 @@ class Robot:
     reset_joints_rad: float = 0.0  # maximum deviation of the joints from the standing pose after a reset
     upright_min: float | None = None  # the robot has fallen if the cosine of the torso's tilt is below this
     height_min_m: float | None = None  # the robot has fallen if the torso is lower than this
-    controller_reward: str = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
+    controller_reward: Literal["velocity", "distance"] = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
     has_heading: bool = False  # the torso has a free joint, so the robot has a heading, which is random after a reset
-    course: str = "maze"  # its world: a "maze" in MuJoCo, or a cluttered "room" in PyBullet
+    course: Literal["maze", "room"] = "maze"  # its world: a "maze" in MuJoCo, or a cluttered "room" in PyBullet
 
     @property
     def reach_m(self) -> float:
@@ -106,6 +108,17 @@ def get_robot(name: str, course: str | None = None) -> Robot:
     return ROBOTS[name]
 
 
+def register(robot: Robot) -> Robot:
+    """Make a robot of one's own known by its name, and return it. Raises UserError if another robot has that name."""
+    if ROBOTS.setdefault(robot.name, robot) != robot:
+        raise UserError(f"there is another robot named {shown(robot.name)}; give yours a name of its own")
+    return robot
+
+
 def model_xml(robot: Robot) -> str:
-    """Text of the robot's MJCF."""
-    return (resources.files("ct_envs") / "assets" / robot.xml).read_text("utf-8")
+    """Text of the robot's MJCF. Raises UserError if the file of a registered robot cannot be read."""
+    file = Path(str(resources.files("ct_envs"))) / "assets" / robot.xml  # an absolute path stays what it is
+    try:
+        return file.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as bad:
+        raise UserError(f"{file}: not the MJCF of robot '{robot.name}' ({bad})") from None
