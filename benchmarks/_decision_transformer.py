@@ -6,7 +6,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from transformers import DecisionTransformerConfig, DecisionTransformerModel  # pyright: ignore
 
-from ct_jax.run import cores
+from ct_jax.runtime.run import cores
 from ct_jax.transformer import GOAL_SCALE_M, RETURN_DIVISOR, ModelConfig
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"

@@ -24,11 +24,11 @@ from rich.console import Console
 from rich.table import Table
 
 import ct_envs.quiet  # noqa: F401
-from ct_jax import devices
 from ct_jax.cli import guarded, leave
-from ct_jax.compilation import keep_programs
-from ct_jax.files import prepare_outputs, write_text
-from ct_jax.run import provenance
+from ct_jax.runtime import devices
+from ct_jax.runtime.compilation import keep_programs
+from ct_jax.runtime.files import prepare_outputs, write_text
+from ct_jax.runtime.run import provenance
 
 RESULTS = Path(__file__).parent / "results"
 PEERS = ("gymnasium-robotics", "ogbench", "ompl", "stable-baselines3", "torch", "transformers")

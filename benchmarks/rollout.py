@@ -28,7 +28,7 @@ from ct_envs import MazeEnv, load_maze
 from ct_jax.collect import collect
 from ct_jax.configs import get_preset
 from ct_jax.model import load_controller
-from ct_jax.run import cores
+from ct_jax.runtime.run import cores
 from ct_jax.worlds.mazes import MazeWorld
 
 MAZE = "antmaze-large"

@@ -26,14 +26,14 @@ from ct_envs import UserError, load_maze, stack_mazes
 from ct_envs.robots import get_robot
 from ct_jax.cli import guarded, leave
 from ct_jax.configs import get_preset
-from ct_jax.devices import replicated, sharded
-from ct_jax.files import prepare_outputs, write_text
 from ct_jax.fit import Fit, transformer_loss
 from ct_jax.heads import make_head
 from ct_jax.learner import updates_on
 from ct_jax.model import sizes
+from ct_jax.runtime.devices import replicated, sharded
+from ct_jax.runtime.files import prepare_outputs, write_text
+from ct_jax.runtime.terminal import printable
 from ct_jax.settings import Settings, controller_config
-from ct_jax.terminal import printable
 from ct_jax.transformer import ControlTransformer, sample_inputs
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"

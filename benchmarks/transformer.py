@@ -101,7 +101,7 @@ def trajectories(robot: str, n: int = TRAJECTORIES, steps: int = STEPS) -> Traje
     normal = lambda *more: jax.random.normal(next(keys), (n, steps, *more))  # noqa: E731
     place = lambda *shape: jax.random.uniform(next(keys), (*shape, 2), minval=4.0, maxval=30.0)  # noqa: E731
     seen = {}
-    if get_robot(robot).course == "room":
+    if get_robot(robot).simulator == "pybullet":
         seen = {"goal_relative": normal(2), "map_bits": jax.random.bits(next(keys), (n, steps, 157), jnp.uint8)}
     return Trajectories(
         position=place(n, steps), proprio=normal(proprio),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ct_jax.pipeline import evaluate_model, train
     from ct_jax.policy import TransformerPolicy
     from ct_jax.prm import PrmConfig
-    from ct_jax.run import Run
+    from ct_jax.runtime.run import Run
     from ct_jax.settings import Settings
     from ct_jax.trajectories import Trajectories
     from ct_jax.transformer import ControlTransformer, ModelConfig
@@ -55,7 +55,7 @@ _NAMES = {
     "ct_jax.configs": ("get_preset",),
     "ct_jax.settings": ("Settings",),
     "ct_jax.prm": ("PrmConfig",),
-    "ct_jax.run": ("Run",),
+    "ct_jax.runtime.run": ("Run",),
     "ct_jax.trajectories": ("Trajectories",),
     "ct_jax.transformer": ("ControlTransformer", "ModelConfig"),
     "ct_jax.types": ("Action", "Controller", "Frame", "Guide", "Observation", "Policy", "World"),

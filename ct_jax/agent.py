@@ -12,8 +12,8 @@ from jaxtyping import Float
 from ct_envs import UserError
 from ct_envs.checked import shown
 from ct_envs.occupancy import MAP_CELLS
-from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.types import AnyArray, Frame, Observation, Privileged
 
 

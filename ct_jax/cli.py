@@ -29,8 +29,8 @@ from tyro.conf import (
 
 from ct_envs.errors import UserError
 from ct_jax import __version__
-from ct_jax.interrupts import Terminated, interruptible
-from ct_jax.terminal import check_stdout, one_line, printable, show_anything
+from ct_jax.runtime.interrupts import Terminated, interruptible
+from ct_jax.runtime.terminal import check_stdout, one_line, printable, show_anything
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -404,9 +404,9 @@ def prepare_jax(among: Processes = Processes()) -> None:
 
     import ct_envs.quiet  # noqa: F401
     import ct_jax.pipeline  # noqa: F401
-    from ct_jax import devices
-    from ct_jax.compilation import keep_programs
-    from ct_jax.run import cores
+    from ct_jax.runtime import devices
+    from ct_jax.runtime.compilation import keep_programs
+    from ct_jax.runtime.run import cores
 
     devices.check_flags()
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax logs hundreds of lines about errors it also raises
@@ -432,7 +432,7 @@ def _import_jax() -> None:
 def _train(command: Train) -> None:
     from ct_jax.configs import find_robot
 
-    if find_robot(command.robot).course == "room":
+    if find_robot(command.robot).simulator == "pybullet":
         _check_in_rooms(command)  # before what takes seconds
     _check_processes(command.among)
     check_stdout()
@@ -440,9 +440,9 @@ def _train(command: Train) -> None:
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
     from ct_jax.configs import get_preset
-    from ct_jax.devices import is_first
     from ct_jax.model import load_controller
-    from ct_jax.run import Run, default_mazes, load_mazes
+    from ct_jax.runtime.devices import is_first
+    from ct_jax.runtime.run import Run, default_mazes, load_mazes
 
     seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
@@ -518,7 +518,7 @@ def _evaluate(command: Evaluate) -> None:
     with _stdout_to_stderr() if command.json else _stdout_as_it_is() as to_stdout:
         prepare_jax(command.among)
         from ct_jax import pipeline
-        from ct_jax.devices import is_first
+        from ct_jax.runtime.devices import is_first
 
         names = ("maze", "episodes", "horizon", "engine", "worlds", "pairs", "density", "noise")
         names += ("return_scale", "picture", "video")
@@ -621,7 +621,7 @@ def _maps(command: Maps) -> None:
     check_stdout()
     _import_jax()
     from ct_envs import maps
-    from ct_jax.files import check_writable, whole
+    from ct_jax.runtime.files import check_writable, whole
 
     found = maps.read_map(command.file, cell_m=command.resolution)
     found = found if command.cell_m is None else found.with_cells(command.cell_m)

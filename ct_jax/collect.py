@@ -10,13 +10,13 @@ import numpy as np
 
 from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Count, Within
-from ct_jax.checkpoint import read_json, write_json
-from ct_jax.devices import first as in_first
-from ct_jax.devices import joined, own_rows
-from ct_jax.files import make_folder
 from ct_jax.guided import Guided
-from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import PrmConfig
+from ct_jax.runtime.checkpoint import read_json, write_json
+from ct_jax.runtime.devices import first as in_first
+from ct_jax.runtime.devices import joined, own_rows
+from ct_jax.runtime.files import make_folder
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.trajectories import Trajectories, concatenate, is_saved, load, save, select, to_trajectories
 from ct_jax.types import Controller, Guide, Rollout, World
 

@@ -10,19 +10,19 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from ct_envs import MazeEnv, Tasks
+from ct_envs import Tasks
 from ct_envs.checked import Checked
 from ct_envs.frames import FrameName
 from ct_envs.maze import Maze
-from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.controllers.augment import AugmentConfig, controller_inputs, input_size
 from ct_jax.controllers.edges import EdgeConfig, EdgeTask, chain_tasks, edge_tasks, split_edges
 from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.sac import SacConfig, blank_statistics, make_networks
-from ct_jax.devices import alike
 from ct_jax.prm import Roadmap
+from ct_jax.rollout import Environment, run
+from ct_jax.runtime.checkpoint import Checkpoints, run_to
+from ct_jax.runtime.devices import alike
 from ct_jax.types import Action, Controller, Frame, act_as_intended
-from ct_jax.worlds.mazes import run as rollout
 
 TESTS = 20  # number of tests of the controller on held-out edges during its training
 
@@ -88,18 +88,18 @@ class Steered:
         return act_as_intended(self.controller(frame.obs.proprio, frame.obs.goal_relative)), memory
 
 
-def edge_success(env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
+def edge_success(env: Environment, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array) -> float:
     """Share of the given edges that the controller walks in time, from rest. ``env`` must be without auto-reset."""
     n = tasks.start.shape[0]
     keys = jax.random.split(key, n + 1)
     one_each = Tasks(tasks.start[:, None], tasks.goal[:, None], jnp.ones(n, jnp.int32))
     state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, 0)))(keys[:n], maze, one_each)
-    state, _, _ = rollout(env, Steered(act), state, (), keys[n], env.horizon)
+    state, _, _ = run(env, Steered(act), state, (), keys[n], env.horizon)
     return float(state.info["success"].mean())
 
 
 def edges_in_a_row(
-    env: MazeEnv, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array, *, edges: int = 20, walkers: int = 100
+    env: Environment, act: Controller, maze: Maze, tasks: Tasks, key: jax.Array, *, edges: int = 20, walkers: int = 100
 ) -> float:
     """Share of the walkers that, from rest, walk ``edges`` edges in a row, each in time and without a fall.
 
@@ -109,7 +109,7 @@ def edges_in_a_row(
     state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, None)))(keys[:walkers], maze, tasks)
     walked, unbroken = np.zeros(walkers, int), np.ones(walkers, bool)
     for i in range(edges):  # each rollout is one full horizon, the time limit of an edge
-        state, _, steps = rollout(env, Steered(act), state, (), keys[walkers + i], env.horizon)
+        state, _, steps = run(env, Steered(act), state, (), keys[walkers + i], env.horizon)
         ended = 1.0 - np.concatenate([np.asarray(steps.alive)[1:], 1.0 - np.asarray(state.done)[None]])
         won = np.asarray(steps.success) > 0
         whole = unbroken & (np.cumsum((ended > 0) & ~won, 0) == 0)
@@ -119,7 +119,7 @@ def edges_in_a_row(
 
 def train_controller(
     key: jax.Array,
-    env_factory: Callable[..., MazeEnv],
+    env_factory: Callable[..., Environment],
     maze: Maze,
     roadmap: Roadmap,
     config: ControllerConfig,
@@ -166,7 +166,7 @@ def train_controller(
     }
 
 
-def start_training(key: jax.Array, env: MazeEnv, maze: Maze, tasks: Tasks, config: ControllerConfig) -> OffPolicy:
+def start_training(key: jax.Array, env: Environment, maze: Maze, tasks: Tasks, config: ControllerConfig) -> OffPolicy:
     """The training on these edges before its first iteration. ``env`` must have auto-reset, and no maps."""
     task = EdgeTask(env, config.edges, config.augment, config.sac.discount)
     return OffPolicy(config.sac, task).create(key, maze, task.start(tasks))

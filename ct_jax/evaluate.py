@@ -8,11 +8,11 @@ import numpy as np
 from scipy import stats
 
 from ct_envs import UserError
-from ct_jax.devices import joined
 from ct_jax.guided import Guided
-from ct_jax.numerics import with_own_numerics
 from ct_jax.pairs import Pairs, beyond_horizon
 from ct_jax.prm import PrmConfig
+from ct_jax.runtime.devices import joined
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.types import Controller, OnProgress, Policy, Rollout, World
 
 METHODS = ("ct", "planner", "explorer")

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_jax.collect import CollectConfig, RunWave, Wave, as_wave
-from ct_jax.devices import joined
 from ct_jax.guided import Guided
-from ct_jax.numerics import with_own_numerics
 from ct_jax.prm import PrmConfig
+from ct_jax.runtime.devices import joined
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.trajectories import OBSERVED, PER_STEP, Trajectories, arrays_of, concatenate, select
 from ct_jax.types import Action, Controller, Frame, Guide, Policy, World
 

@@ -22,9 +22,9 @@ from ct_envs import Robot, UserError
 from ct_envs.checked import Above, Checked, Count, Within
 from ct_envs.frames import Symmetries, symmetries, turns
 from ct_envs.maze import Maze
-from ct_jax.checkpoint import Checkpoints
-from ct_jax.devices import data_mesh, feed, joined, largest, place, replicated, sharded
 from ct_jax.learner import Info, learn
+from ct_jax.runtime.checkpoint import Checkpoints
+from ct_jax.runtime.devices import data_mesh, feed, joined, largest, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, pad, sample_windows, select
 from ct_jax.transformer import RETURN_DIVISOR, ControlTransformer, Modes, sample_inputs
 from ct_jax.value import ValueNetwork

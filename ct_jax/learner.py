@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from ct_jax.checkpoint import Checkpoints, run_to
-from ct_jax.devices import replicated
+from ct_jax.runtime.checkpoint import Checkpoints, run_to
+from ct_jax.runtime.devices import replicated
 
 Info = dict[str, jax.Array]  # what an update reports, each a number
 

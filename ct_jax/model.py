@@ -11,18 +11,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ct_envs import MazeEnv, UserError
+from ct_envs import UserError
 from ct_envs.checked import shown
-from ct_envs.turtlebot3 import ACTION_SIZE, PROPRIO_SIZE
 from ct_jax.agent import Agent
-from ct_jax.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
 from ct_jax.configs import find_robot
 from ct_jax.controller import ControllerConfig, SacController, blank_controller
 from ct_jax.controllers.differential_drive import DifferentialDrive
-from ct_jax.files import make_folder, whole
 from ct_jax.heads import make_head
-from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
+from ct_jax.runtime.checkpoint import arrange_weights, read_json, read_weights, save_weights, write_json
+from ct_jax.runtime.files import make_folder, whole
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.settings import (
     Settings,
     controller_config,
@@ -33,6 +32,7 @@ from ct_jax.settings import (
 )
 from ct_jax.transformer import ControlTransformer, sample_inputs
 from ct_jax.value import ValueNetwork
+from ct_jax.worlds import kind_of
 
 ZOO = "zoo:"
 FORMAT = 4  # of model.json and controller.json; this version reads 1 to it
@@ -202,10 +202,8 @@ def _sizes(robot: str) -> dict[str, Any]:
 
 def sizes(robot: str) -> tuple[int, int]:
     """Entries of a robot's proprioception and of its action."""
-    if find_robot(robot).course == "room":
-        return PROPRIO_SIZE, ACTION_SIZE
-    env = MazeEnv(robot, engine="mujoco")
-    return env.proprio_size, env.action_size
+    found = find_robot(robot)
+    return kind_of(found).sizes(found)
 
 
 def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacController | DifferentialDrive]:
@@ -235,14 +233,13 @@ def blank_model(robot: str, settings: Settings) -> tuple[TransformerPolicy, SacC
         )
 
     policy = jax.eval_shape(build, jax.random.key(0))
-    if find_robot(robot).course == "room":
-        return policy, DifferentialDrive()
-    return policy, _blank_sac(robot, controller_config(settings))
+    known = kind_of(find_robot(robot)).KNOWN_CONTROLLER
+    return policy, known or _blank_sac(robot, controller_config(settings))
 
 
 def _check_robot(robot: str, settings: Settings) -> None:
     """Raise UserError for settings that are not for the robot."""
-    if settings.model.skill and find_robot(robot).course == "room":
+    if settings.model.skill and kind_of(find_robot(robot)).KNOWN_CONTROLLER:
         raise UserError(f"model.skill is for a controller that was learned; the {robot}'s is known")
     for name, frame in (("model", settings.model.frame), ("augment", settings.augment.frame)):
         if frame == "heading" and not find_robot(robot).has_heading:

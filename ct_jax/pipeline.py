@@ -16,9 +16,7 @@ import numpy as np
 
 from ct_envs import UserError
 from ct_envs.robots import Robot, get_robot
-from ct_jax import devices
 from ct_jax import trajectories as storage
-from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.collect import collect, kept_in
 from ct_jax.controller import ControllerConfig
 from ct_jax.evaluate import METHODS, Episodes, evaluate
@@ -26,10 +24,12 @@ from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.heads import with_skill
 from ct_jax.model import TrainedModel, blank_model, load_model, save_model, sizes
-from ct_jax.numerics import with_own_numerics
 from ct_jax.policy import TransformerPolicy
-from ct_jax.progress import Bar, Metrics
-from ct_jax.run import Run, drop_leftovers, is_row, kept_row, open_run, training
+from ct_jax.runtime import devices
+from ct_jax.runtime.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.runtime.numerics import with_own_numerics
+from ct_jax.runtime.progress import Bar, Metrics
+from ct_jax.runtime.run import Run, drop_leftovers, is_row, kept_row, open_run, training
 from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED, with_controller
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
@@ -314,7 +314,7 @@ def _asking(model: TrainedModel, method: str, return_scale: float) -> TrainedMod
 
 
 def _check_processes(robot: Robot) -> None:
-    if robot.course == "room" and jax.process_count() > 1:
+    if robot.simulator == "pybullet" and jax.process_count() > 1:
         raise UserError(f"the {robot.name} drives in PyBullet, which is one process's; start only one")
 
 

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from ct_envs.checked import Above, Checked, Within
 from ct_envs.errors import UserError
 from ct_envs.maze import Maze, clearance, label_regions, segment_free, segment_reach, unpadded
-from ct_jax.files import whole
+from ct_jax.runtime.files import whole
 
 _ALL_PAIRS = 2048  # points; the table of a larger roadmap holds the paths to its goals only, to save memory
 _JOINED_SHARE = 0.5  # without given ends, a roadmap is complete if it joins this share of the pairs of its own points

@@ -18,8 +18,8 @@ from ct_envs.checked import shown
 from ct_envs.frames import Symmetries, transform
 from ct_envs.maze import Maze
 from ct_envs.occupancy import MAP_CELLS, local_map
-from ct_jax import devices
-from ct_jax.files import save_arrays
+from ct_jax.runtime import devices
+from ct_jax.runtime.files import save_arrays
 from ct_jax.types import Rollout, Steps
 
 _PAD_STEPS = 64  # trajectories are padded to a multiple of this many steps

@@ -16,9 +16,9 @@ import tyro
 
 import ct_envs.quiet  # noqa: F401
 from ct_envs import UserError
-from ct_jax.checkpoint import read_json, write_json
 from ct_jax.cli import guarded, leave
-from ct_jax.files import prepare_outputs, whole
+from ct_jax.runtime.checkpoint import read_json, write_json
+from ct_jax.runtime.files import prepare_outputs, whole
 
 ZOO = Path(__file__).parents[1] / "ct_jax" / "zoo" / "controllers"
 

@@ -17,7 +17,7 @@ from study import Study, load_variants, pt_cql
 
 from ct_envs import UserError
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
-from ct_jax.files import prepare_outputs
+from ct_jax.runtime.files import prepare_outputs
 
 TUNING_SEED = 7  # of the pairs
 FILE = RESULTS / "cql.json"

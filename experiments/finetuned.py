@@ -19,10 +19,10 @@ from study import as_digits, digest_arrays, load_variants
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.evaluate import evaluate
-from ct_jax.files import prepare_outputs
 from ct_jax.model import load_model
-from ct_jax.progress import Bar
-from ct_jax.run import provenance
+from ct_jax.runtime.files import prepare_outputs
+from ct_jax.runtime.progress import Bar
+from ct_jax.runtime.run import provenance
 from ct_jax.worlds.mazes import MazeWorld
 
 FILE = RESULTS / "finetuned.json"

@@ -20,9 +20,9 @@ from ct_envs import Maze, MazeEnv, UserError, load_maze
 from ct_envs.maze import unpadded
 from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import evaluate
-from ct_jax.files import check_writable, whole
 from ct_jax.model import load_model
 from ct_jax.report.video import check_video, write_video
+from ct_jax.runtime.files import check_writable, whole
 from ct_jax.worlds.maze_runs import as_film
 from ct_jax.worlds.mazes import MazeWorld
 

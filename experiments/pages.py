@@ -35,7 +35,7 @@ from tables import (
 )
 
 from ct_jax.cli import guarded, leave
-from ct_jax.files import prepare_outputs, write_text
+from ct_jax.runtime.files import prepare_outputs, write_text
 
 ROOT = Path(__file__).parents[1]
 BENCHMARKS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs"

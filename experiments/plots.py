@@ -10,7 +10,7 @@ from intervals import rate_of
 from matplotlib.figure import Figure
 from rows import CT, Row, TransferRow
 
-from ct_jax.files import whole
+from ct_jax.runtime.files import whole
 
 HELD_OUT_ENOUGH = 0.97  # a good success rate on held-out edges
 

@@ -10,8 +10,8 @@ import numpy as np
 
 import ct_envs.quiet  # noqa: F401
 from ct_envs import UserError
-from ct_jax.checkpoint import read_json, write_json
 from ct_jax.evaluate import GUIDED
+from ct_jax.runtime.checkpoint import read_json, write_json
 
 RESULTS = Path(__file__).parent / "results"
 CT = "ct"  # the method of all rows of transformers

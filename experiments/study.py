@@ -27,15 +27,15 @@ from ct_jax import trajectories as storage
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
 from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
 from ct_jax.baselines.sac_alone import SacAloneConfig, train_sac_alone
-from ct_jax.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.configs import get_preset
 from ct_jax.evaluate import GUIDED
-from ct_jax.files import prepare_outputs
 from ct_jax.finetune import NoRecoveryError
 from ct_jax.model import PARTS, load_controller
-from ct_jax.progress import Metrics
-from ct_jax.run import (
+from ct_jax.runtime.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.runtime.files import prepare_outputs
+from ct_jax.runtime.progress import Metrics
+from ct_jax.runtime.run import (
     Run,
     default_mazes,
     episodes_file,
@@ -45,8 +45,8 @@ from ct_jax.run import (
     provenance,
     training,
 )
+from ct_jax.runtime.terminal import printable
 from ct_jax.settings import Settings, to_dict
-from ct_jax.terminal import printable
 from ct_jax.worlds import kind_of
 from ct_jax.worlds.maze_runs import make_env
 

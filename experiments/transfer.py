@@ -22,14 +22,14 @@ from ct_envs import Maze, MazeEnv, UserError, stack_mazes
 from ct_envs.maze import make_maze, parse_walls
 from ct_jax import pipeline
 from ct_jax import trajectories as storage
-from ct_jax.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.cli import guarded, leave, prepare_jax
 from ct_jax.evaluate import evaluate
-from ct_jax.files import prepare_outputs
 from ct_jax.fit import Fit, fit, init_params
 from ct_jax.model import TrainedModel, load_model
-from ct_jax.progress import Bar
-from ct_jax.run import provenance, random_mazes
+from ct_jax.runtime.checkpoint import Checkpoints, read_json, write_json
+from ct_jax.runtime.files import prepare_outputs
+from ct_jax.runtime.progress import Bar
+from ct_jax.runtime.run import provenance, random_mazes
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
 from ct_jax.worlds.mazes import MazeWorld

@@ -26,10 +26,10 @@ from study import Options, Study, Variant, about, choose, keep_once, label, show
 
 from ct_jax.cli import guarded, leave
 from ct_jax.evaluate import GUIDED
-from ct_jax.files import make_folder, prepare_outputs
 from ct_jax.model import TrainedModel, load_model
 from ct_jax.pipeline import answer, measured
-from ct_jax.run import Run
+from ct_jax.runtime.files import make_folder, prepare_outputs
+from ct_jax.runtime.run import Run
 from ct_jax.worlds.room_runs import Request, SevenPairs, grades
 
 DENSITIES = (0.5, 1.5, 2.0)  # in addition to 1, which all variants have

@@ -16,7 +16,7 @@ from ct_envs import measure_maze
 from ct_envs.generators import GENERATORS
 from ct_envs.unseen import TEST_MAZES, generator_of, test_maze, test_pairs, training_maze
 from ct_jax.cli import guarded, leave
-from ct_jax.files import prepare_outputs, whole, write_text
+from ct_jax.runtime.files import prepare_outputs, whole, write_text
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, PICTURE = DOCS / "unseen-maze.md", DOCS / "unseen-maze.png"

@@ -18,16 +18,16 @@ import numpy as np
 from flax import struct
 
 from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
-from ct_jax import devices, interrupts
-from ct_jax.checkpoint import Checkpoints
 from ct_jax.collect import CollectConfig, collect
 from ct_jax.evaluate import evaluate
 from ct_jax.fit import Fit, FitConfig, fit, init_params, spread, transformer_loss
-from ct_jax.interrupts import interruptible, raise_if_interrupted
 from ct_jax.learner import updates_on
 from ct_jax.pairs import Pairs
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
+from ct_jax.runtime import devices, interrupts
+from ct_jax.runtime.checkpoint import Checkpoints
+from ct_jax.runtime.interrupts import interruptible, raise_if_interrupted
 from ct_jax.trajectories import Trajectories, load
 from ct_jax.transformer import ControlTransformer, ModelConfig
 from ct_jax.value import ValueNetwork

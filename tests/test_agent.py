@@ -10,8 +10,9 @@ import pytest
 import ct_jax
 from ct_envs import MazeEnv, load_maze, stack_mazes
 from ct_jax.model import sizes
+from ct_jax.rollout import as_frame, run
 from ct_jax.transformer import ControlTransformer
-from ct_jax.worlds.mazes import as_frame, run, start_episodes
+from ct_jax.worlds.mazes import start_episodes
 
 ROBOTS = ("point", "ant", "humanoid", "turtlebot3")
 N, STEPS = 3, 5

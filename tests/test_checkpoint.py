@@ -17,9 +17,9 @@ import pytest
 from flax import struct
 
 from ct_envs import UserError
-from ct_jax import checkpoint
-from ct_jax.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
-from ct_jax.interrupts import Terminated, interruptible
+from ct_jax.runtime import checkpoint
+from ct_jax.runtime.checkpoint import Checkpoints, load_weights, read_json, save_weights, write_json
+from ct_jax.runtime.interrupts import Terminated, interruptible
 
 
 @struct.dataclass

@@ -14,11 +14,12 @@ import pytest
 
 from ct_envs import MazeEnv, load_maze
 from ct_envs.maze import sample_pair
-from ct_jax import compilation
 from ct_jax.evaluate import evaluate
 from ct_jax.model import load_model
 from ct_jax.pairs import Pairs
-from ct_jax.worlds.mazes import MazeWorld, run
+from ct_jax.rollout import run
+from ct_jax.runtime import compilation
+from ct_jax.worlds.mazes import MazeWorld
 
 pytestmark = pytest.mark.rank_promotion("allow")
 

@@ -9,11 +9,12 @@ import pytest
 
 from ct_envs import POINT, MazeEnv, load_maze, stack_mazes
 from ct_jax.baselines.cql import Cql, CqlConfig, train_cql, transitions
-from ct_jax.checkpoint import Checkpoints
 from ct_jax.learner import train
+from ct_jax.rollout import as_frame
+from ct_jax.rollout import run as roll_out
+from ct_jax.runtime.checkpoint import Checkpoints
 from ct_jax.trajectories import sample_windows, select
-from ct_jax.worlds.mazes import as_frame, start_episodes
-from ct_jax.worlds.mazes import run as roll_out
+from ct_jax.worlds.mazes import start_episodes
 
 UMAZE = load_maze("antmaze-umaze")
 MAZES = stack_mazes([UMAZE])

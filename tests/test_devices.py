@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ct_envs import UserError
-from ct_jax import devices
+from ct_jax.runtime import devices
 from ct_jax.trajectories import is_saved, load, save
 
 pytestmark = pytest.mark.slow  # on two cores a minute
@@ -143,7 +143,7 @@ def test_files_of_several_processes_are_divided_evenly(tmp_path, toy_data, monke
 LISTEN = """
 import os, sys
 from ct_envs import UserError
-from ct_jax import devices
+from ct_jax.runtime import devices
 try:
     devices.start(sys.argv[1], 1, 0)
 except UserError as bad:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import ct_jax
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls
 from ct_envs.maze import load_walls
-from ct_jax.devices import data_mesh, fill_up
 from ct_jax.evaluate import (
     Episodes,
     bootstrap,
@@ -24,6 +23,7 @@ from ct_jax.evaluate import (
 from ct_jax.pairs import Pairs, beyond_horizon, horizon_for, shortest_ways
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
+from ct_jax.runtime.devices import data_mesh, fill_up
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.types import act_as_intended
 from ct_jax.value import ValueNetwork

@@ -38,10 +38,10 @@ from ct_envs import UserError
 from ct_envs.robots import get_robot
 from ct_jax.baselines.cql import CqlConfig
 from ct_jax.baselines.sac_alone import SacAloneConfig
-from ct_jax.checkpoint import read_json
 from ct_jax.configs import get_preset
 from ct_jax.finetune import NoRecoveryError
-from ct_jax.run import Run, load_mazes
+from ct_jax.runtime.checkpoint import read_json
+from ct_jax.runtime.run import Run, load_mazes
 from ct_jax.settings import with_fits
 
 MADE = {"command": "python x.py", "commit": "abc", "hardware": "CPU", "created": "2026-01-01T00:00:00"}

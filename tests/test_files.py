@@ -14,10 +14,10 @@ import pytest
 from ct_envs import UserError
 from ct_envs.maze import load_walls
 from ct_jax import trajectories
-from ct_jax.checkpoint import Checkpoints, save_weights, write_json
 from ct_jax.cli import main
-from ct_jax.files import append_to, check_writable, drop_parts, make_folder, save_arrays, whole, write_text
-from ct_jax.progress import Metrics
+from ct_jax.runtime.checkpoint import Checkpoints, save_weights, write_json
+from ct_jax.runtime.files import append_to, check_writable, drop_parts, make_folder, save_arrays, whole, write_text
+from ct_jax.runtime.progress import Metrics
 
 CONTENT = np.random.default_rng(0).random(20_000)  # it cannot be compressed
 

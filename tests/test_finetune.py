@@ -10,16 +10,17 @@ from flax import struct
 
 from ct_envs import POINT, MazeEnv, UserError, load_maze, make_maze, random_walls, stack_mazes
 from ct_jax.collect import CollectConfig
-from ct_jax.devices import data_mesh, fill_up
 from ct_jax.finetune import RecoverConfig, TakeoverPolicy, lie_for_ever, recover
 from ct_jax.guided import Guided
 from ct_jax.policy import TransformerPolicy
 from ct_jax.prm import PrmConfig
+from ct_jax.rollout import as_frame
+from ct_jax.runtime.devices import data_mesh, fill_up
 from ct_jax.trajectories import PER_STEP
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.types import act_as_intended
 from ct_jax.value import ValueNetwork
-from ct_jax.worlds.mazes import MazeWorld, as_frame, start_episodes
+from ct_jax.worlds.mazes import MazeWorld, start_episodes
 
 pytestmark = pytest.mark.rank_promotion("allow")
 

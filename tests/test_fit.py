@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ct_envs import POINT, UserError, load_maze, stack_mazes
-from ct_jax.checkpoint import Checkpoints
 from ct_jax.fit import (
     MODE_SPREAD,
     Fit,
@@ -23,6 +22,7 @@ from ct_jax.fit import (
 )
 from ct_jax.learner import train, updates_on
 from ct_jax.pipeline import make_learner
+from ct_jax.runtime.checkpoint import Checkpoints
 from ct_jax.trajectories import sample_windows
 from ct_jax.transformer import ControlTransformer, ModelConfig, Modes
 from ct_jax.value import ValueNetwork

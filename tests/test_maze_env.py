@@ -93,7 +93,9 @@ def test_observations_without_maps_have_other_entries():
 
 
 def test_unknown_names_are_error():
-    with pytest.raises(UserError, match=", ".join(name for name, robot in ROBOTS.items() if robot.course == "maze")):
+    with pytest.raises(
+        UserError, match=", ".join(name for name, robot in ROBOTS.items() if robot.simulator == "mujoco")
+    ):
         MazeEnv("unicycle")
     with pytest.raises(UserError, match="mjx, mujoco"):
         MazeEnv(engine="bullet")

@@ -17,14 +17,14 @@ import pytest
 
 from ct_envs import UserError, load_maze, robots
 from ct_jax import pipeline
-from ct_jax import run as runs
 from ct_jax import trajectories as storage
-from ct_jax.checkpoint import read_json
 from ct_jax.cli import main
 from ct_jax.evaluate import METHODS
 from ct_jax.model import load_model
-from ct_jax.progress import Bar, Metrics
-from ct_jax.run import Run, load_mazes, maze_text, open_run, random_mazes
+from ct_jax.runtime import run as runs
+from ct_jax.runtime.checkpoint import read_json
+from ct_jax.runtime.progress import Bar, Metrics
+from ct_jax.runtime.run import Run, load_mazes, maze_text, open_run, random_mazes
 from ct_jax.settings import Settings
 from ct_jax.worlds import Trial, kind_of, maze_runs
 from ct_jax.worlds.mazes import MazeWorld

@@ -9,9 +9,10 @@ import pytest
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
 from ct_jax.policy import TransformerPolicy
+from ct_jax.rollout import as_frame, run
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 from ct_jax.value import ValueNetwork
-from ct_jax.worlds.mazes import as_frame, run, start_episodes
+from ct_jax.worlds.mazes import start_episodes
 
 pytestmark = pytest.mark.rank_promotion("allow")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from ct_jax import progress
-from ct_jax.interrupts import interruptible
-from ct_jax.progress import Bar, Metrics
+from ct_jax.runtime import progress
+from ct_jax.runtime.interrupts import interruptible
+from ct_jax.runtime.progress import Bar, Metrics
 
 
 def test_terminal_shows_bar_with_remaining_time():

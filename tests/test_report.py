@@ -18,7 +18,7 @@ from ct_envs import UserError
 from ct_envs.maze import draw_walls, load_walls
 from ct_jax.report import draw_maze, draw_paths, pictures, reading, words, write_report
 from ct_jax.report.page import page as to_html
-from ct_jax.terminal import printable
+from ct_jax.runtime.terminal import printable
 
 SEEN, UNSEEN = "antmaze-umaze", "antmaze-medium"
 METHODS = ("ct", "planner", "explorer", "some-other")

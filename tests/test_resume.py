@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from ct_jax import pipeline
-from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.configs import point, turtlebot3
 from ct_jax.fit import FitConfig, ValueConfig
+from ct_jax.runtime.checkpoint import Checkpoints, run_to
 from ct_jax.settings import RoomConfig
 
 pytestmark = pytest.mark.rank_promotion("allow")
@@ -34,7 +34,8 @@ OPERATIONS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scan
 def live(arguments, settings, folder, stage, operations, cache):
     """Run to the end, or for a number of file operations after the first one in a stage's folder."""
     from ct_envs import robots
-    from ct_jax import checkpoint, cli
+    from ct_jax import cli
+    from ct_jax.runtime import checkpoint
 
     robots.ROBOTS["point"] = replace(robots.POINT, horizon=50)
     point.PRESETS["tiny"] = turtlebot3.PRESETS["tiny"] = settings

@@ -7,12 +7,12 @@ import pytest
 from flax import struct
 
 from ct_envs import MazeEnv, load_maze, stack_mazes
-from ct_envs.maze_env import broke_off
 from ct_jax.collect import CollectConfig
 from ct_jax.guided import Guided
 from ct_jax.prm import PrmConfig
+from ct_jax.rollout import as_frame, broke_off, run
 from ct_jax.types import act_as_intended
-from ct_jax.worlds.mazes import MazeWorld, as_frame, run, start_episodes
+from ct_jax.worlds.mazes import MazeWorld, start_episodes
 
 N = 4
 ENV = MazeEnv("point", engine="mujoco", auto_reset=False, maps=False, horizon=9)

@@ -12,7 +12,6 @@ from brax.training.types import Transition
 
 from ct_envs import ANT, POINT, MazeEnv, Tasks, UserError, load_maze
 from ct_envs.frames import symmetries
-from ct_jax.checkpoint import Checkpoints
 from ct_jax.controller import (
     ControllerConfig,
     SacController,
@@ -29,6 +28,7 @@ from ct_jax.controllers.off_policy import OffPolicy, Replay
 from ct_jax.controllers.reward import RewardConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.prm import PrmConfig, build_roadmap
+from ct_jax.runtime.checkpoint import Checkpoints
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's running statistics
 

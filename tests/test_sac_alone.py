@@ -10,10 +10,10 @@ import pytest
 from ct_envs import POINT, MazeEnv, load_maze
 from ct_envs.occupancy import local_map
 from ct_jax.baselines.sac_alone import SacAloneConfig, start_training, train_sac_alone
-from ct_jax.checkpoint import Checkpoints
 from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import Pairs, evaluate
+from ct_jax.runtime.checkpoint import Checkpoints
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's replay
 

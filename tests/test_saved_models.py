@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 from ct_envs import UserError
-from ct_jax.checkpoint import _sum_of_arrays, load_weights, save_weights
 from ct_jax.controller import ControllerConfig
 from ct_jax.controllers.augment import AugmentConfig
 from ct_jax.controllers.edges import EdgeConfig
@@ -32,6 +31,7 @@ from ct_jax.model import (
     save_model,
     zoo_names,
 )
+from ct_jax.runtime.checkpoint import _sum_of_arrays, load_weights, save_weights
 from ct_jax.settings import Settings, controller_config, from_dict, to_dict
 from ct_jax.transformer import ModelConfig
 

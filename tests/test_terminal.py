@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from ct_jax.cli import guarded, main, print_rows
-from ct_jax.progress import Bar
-from ct_jax.terminal import one_line, printable, show_anything
+from ct_jax.runtime.progress import Bar
+from ct_jax.runtime.terminal import one_line, printable, show_anything
 
 ROOT = Path(__file__).parents[1]
 EVIL = "\x1b]0;mine\x07\x1b[31m[/red]:smile:\u202e\n"  # also markup of rich

@@ -14,7 +14,7 @@ from plots import draw_transfer
 from rows import TransferRow, read_rows
 
 from ct_envs import UserError, load_maze, stack_mazes
-from ct_jax.checkpoint import write_json
+from ct_jax.runtime.checkpoint import write_json
 from ct_jax.transfer import BODY, transfer
 from ct_jax.transformer import ControlTransformer, ModelConfig, sample_inputs
 

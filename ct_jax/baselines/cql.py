@@ -28,9 +28,9 @@ from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.frames import FrameName, symmetries
 from ct_envs.maze import Maze
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
-from ct_jax.checkpoint import Checkpoints
-from ct_jax.devices import data_mesh, place, replicated, sharded
 from ct_jax.learner import Info, learn
+from ct_jax.runtime.checkpoint import Checkpoints
+from ct_jax.runtime.devices import data_mesh, place, replicated, sharded
 from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
 
 

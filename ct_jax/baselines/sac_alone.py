@@ -17,17 +17,17 @@ from brax.training.networks import FeedForwardNetwork
 from brax.training.types import Transition
 from jaxtyping import Array, Float
 
-from ct_envs import MazeEnv
 from ct_envs.checked import Checked
 from ct_envs.frames import FrameName
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
-from ct_jax.checkpoint import Checkpoints, run_to
 from ct_jax.controllers.augment import check_frame
 from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.reward import Reward, RewardConfig
 from ct_jax.controllers.sac import SacConfig
+from ct_jax.rollout import Environment
+from ct_jax.runtime.checkpoint import Checkpoints, run_to
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def _make_networks(
 class MazeTask:
     """Crossing the maze: an ``off_policy.Task``."""
 
-    env: MazeEnv  # with auto-reset and without maps
+    env: Environment  # with auto-reset and without maps
     reward_config: RewardConfig
     frame: FrameName
     discount: float
@@ -109,7 +109,7 @@ class MazeTask:
         return self.reward.pay_falls(batch._replace(observation=now, next_observation=after), share, self.discount)
 
 
-def start_training(key: jax.Array, env: MazeEnv, maze: Maze, config: SacAloneConfig) -> OffPolicy:
+def start_training(key: jax.Array, env: Environment, maze: Maze, config: SacAloneConfig) -> OffPolicy:
     """The training before its first iteration. ``env`` must have auto-reset, and no maps."""
     task = MazeTask(env, config.reward, config.frame, config.sac.discount)
     return OffPolicy(config.sac, task).create(key, maze, None)
@@ -117,7 +117,7 @@ def start_training(key: jax.Array, env: MazeEnv, maze: Maze, config: SacAloneCon
 
 def train_sac_alone(
     key: jax.Array,
-    env_factory: Callable[..., MazeEnv],
+    env_factory: Callable[..., Environment],
     maze: Maze,
     config: SacAloneConfig,
     *,

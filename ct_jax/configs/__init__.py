@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 _SHARED = "base"  # a file that is no robot's
 
 
-def find_robot(name: str, course: str | None = None) -> Robot:
+def find_robot(name: str, simulator: str | None = None) -> Robot:
     """The robot of that name, be it one that its file here registers. Raises UserError with the valid names."""
     if name not in ROBOTS:  # the files take a second or two
         _all_presets()
-    return get_robot(name, course)
+    return get_robot(name, simulator)
 
 
 def get_preset(name: str, robot: str = "point") -> "Settings":

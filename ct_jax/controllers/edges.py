@@ -14,7 +14,7 @@ from brax.training.agents.sac import networks as sac_networks
 from brax.training.types import Transition
 from jaxtyping import Array, Float
 
-from ct_envs import MazeEnv, Tasks, UserError
+from ct_envs import Tasks, UserError
 from ct_envs.checked import Above, Checked, Share, Within
 from ct_envs.frames import symmetries
 from ct_envs.maze import Maze
@@ -22,6 +22,7 @@ from ct_jax.controllers.augment import AugmentConfig, check_frame, controller_in
 from ct_jax.controllers.reward import Ramp, Reward, RewardConfig, check_ramp
 from ct_jax.controllers.sac import SacConfig, make_networks
 from ct_jax.prm import Roadmap
+from ct_jax.rollout import Environment
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def chain_tasks(tasks: Tasks, seed: int, choices: int = 8) -> Tasks:
 class EdgeTask:
     """Walking edges: an ``off_policy.Task``."""
 
-    env: MazeEnv  # with auto-reset and without maps; its robot determines the kind of reward
+    env: Environment  # with auto-reset and without maps; its robot determines the kind of reward
     edges: EdgeConfig
     augment: AugmentConfig
     discount: float

@@ -16,18 +16,18 @@ from brax.training.types import Transition
 from flax import struct
 from jaxtyping import Array, Float
 
-from ct_envs import MazeEnv, Tasks
+from ct_envs import Tasks
 from ct_envs.maze import Maze
-from ct_envs.maze_env import broke_off
 from ct_jax.controllers.sac import Sac, SacConfig
 from ct_jax.learner import Info
+from ct_jax.rollout import Environment, broke_off
 
 
 class Task(Protocol):
     """What is learned: a hashable description."""
 
     @property
-    def env(self) -> MazeEnv:
+    def env(self) -> Environment:
         """With auto-reset and without maps."""
         ...
 

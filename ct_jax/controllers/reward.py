@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ct_envs import UserError
 from ct_envs.checked import Above, Checked, Share, Within
 from ct_envs.frames import own_frame
-from ct_envs.maze_env import broke_off
+from ct_jax.rollout import broke_off
 
 Metres = Annotated[float, Within(0, 1_000_000)]  # also for other terms of the reward
 Ramp = tuple[Share, Share]  # begin and end of a change, in shares of the training

@@ -6,11 +6,11 @@
 
 from pathlib import Path
 
-from ct_jax.files import check_writable, write_text
 from ct_jax.report.overview import write_overview
 from ct_jax.report.page import page
 from ct_jax.report.pictures import draw_maze, draw_paths
 from ct_jax.report.reading import read_run
+from ct_jax.runtime.files import check_writable, write_text
 
 __all__ = ["draw_maze", "draw_paths", "write_report"]
 

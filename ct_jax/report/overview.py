@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ct_jax.files import whole
 from ct_jax.report import pictures, words
 from ct_jax.report.page import curves_of
 from ct_jax.report.pictures import LIGHT
 from ct_jax.report.reading import Run, number
+from ct_jax.runtime.files import whole
 
 WIDTH, MARGIN, GAP = 8.27, 0.6, 0.3  # [in]
 _INNER = WIDTH - 2 * MARGIN

@@ -18,7 +18,7 @@ from ct_jax import __version__
 from ct_jax.report import pictures, words
 from ct_jax.report.pictures import LIGHT
 from ct_jax.report.reading import METHODS, STAGES, Curve, Episodes, Run, number
-from ct_jax.terminal import printable
+from ct_jax.runtime.terminal import printable
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # forbids the browser to load anything
 MOST_MAZES = 12  # maximum number of mazes that are drawn

@@ -25,9 +25,9 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, StrMethodFormatter
 
 from ct_envs.turtlebot3_world import World
-from ct_jax.files import whole
 from ct_jax.report.reading import Place
-from ct_jax.terminal import printable
+from ct_jax.runtime.files import whole
+from ct_jax.runtime.terminal import printable
 
 if TYPE_CHECKING:
     from ct_jax.evaluate import Episodes

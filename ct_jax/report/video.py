@@ -16,8 +16,8 @@ from ct_envs.errors import UserError
 from ct_envs.maze import Maze, unpadded
 from ct_envs.physics import static_spec
 from ct_envs.robots import Robot
-from ct_jax.files import check_writable, whole
-from ct_jax.progress import Bar
+from ct_jax.runtime.files import check_writable, whole
+from ct_jax.runtime.progress import Bar
 
 SIZE = 480, 640  # pixels, height and width
 MOST_FPS = 25

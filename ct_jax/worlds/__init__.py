@@ -46,6 +46,11 @@ class Kind(Protocol):
     """What the pipeline needs of a kind of world: the functions and names of a module."""
 
     Request: type[Request]
+    KNOWN_CONTROLLER: Any | None  # pi_c, where it is not learned
+
+    def sizes(self, robot: Robot) -> tuple[int, int]:
+        """Entries of a robot's proprioception and of its action."""
+        ...
 
     def open_training(self, run: Any, *, maps: bool) -> AbstractContextManager[World]:
         """The world of a run's collection (without local maps, where they can be recomputed) and recoveries."""
@@ -60,9 +65,9 @@ class Kind(Protocol):
         ...
 
 
-_KINDS = {"maze": "ct_jax.worlds.maze_runs", "room": "ct_jax.worlds.room_runs"}
+_KINDS = {"mujoco": "ct_jax.worlds.maze_runs", "pybullet": "ct_jax.worlds.room_runs"}
 
 
 def kind_of(robot: Robot) -> Kind:
     """The kind of world that a robot drives in. Its simulator is imported only here."""
-    return import_module(_KINDS[robot.course])  # pyright: ignore[reportReturnType]
+    return import_module(_KINDS[robot.simulator])  # pyright: ignore[reportReturnType]

@@ -11,24 +11,31 @@ import numpy as np
 
 from ct_envs import MazeEnv, UserError, load_maze
 from ct_envs.maze import Maze, unpadded
-from ct_envs.robots import get_robot
-from ct_jax import devices
-from ct_jax.checkpoint import read_json, write_json
+from ct_envs.robots import Robot, get_robot
 from ct_jax.controller import ControllerConfig, SacController, train_controller
 from ct_jax.evaluate import Episodes, check_horizon
-from ct_jax.files import check_writable, save_arrays
 from ct_jax.model import TrainedModel, copy_controller, load_controller, save_controller
 from ct_jax.pairs import Pairs, horizon_for
 from ct_jax.prm import Roadmap, build_roadmap
-from ct_jax.progress import Metrics
-from ct_jax.run import Run, join_mazes, slug, training
+from ct_jax.runtime import devices
+from ct_jax.runtime.checkpoint import read_json, write_json
+from ct_jax.runtime.files import check_writable, save_arrays
+from ct_jax.runtime.progress import Metrics
+from ct_jax.runtime.run import Run, join_mazes, slug, training
 from ct_jax.settings import MAX_EPISODES, controller_config
 from ct_jax.worlds import Trial
 from ct_jax.worlds.mazes import MazeWorld
 
 PICTURES = (".png", ".svg", ".pdf")
 _FAR_M = 1e6  # no maze is so large
+KNOWN_CONTROLLER = None
 PAIR_ARRAYS = ("start", "goal", "shortest_m")
+
+
+def sizes(robot: Robot) -> tuple[int, int]:
+    """Entries of a robot's proprioception and of its action."""
+    env = MazeEnv(robot, engine="mujoco")
+    return env.proprio_size, env.action_size
 
 
 def make_env(run: Run, **options: Any) -> MazeEnv:

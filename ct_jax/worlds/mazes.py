@@ -1,7 +1,6 @@
 """The world of mazes: ``MazeEnv`` under jit, sharded over devices."""
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
-from jax.sharding import Mesh
 from jaxtyping import Int
 
 from ct_envs import MazeEnv, check_tasks, stack_mazes
@@ -17,14 +15,15 @@ from ct_envs import Tasks as Episodes
 from ct_envs.maze import Maze, sample_pair
 from ct_envs.robots import Robot
 from ct_jax.collect import CollectConfig
-from ct_jax.devices import data_mesh, fill_up, joined, largest, own, own_rows, place, sharded
 from ct_jax.guides.explorer import ExplorerGuide
 from ct_jax.guides.roadmap import RoadmapGuide
-from ct_jax.interrupts import raise_if_interrupted
-from ct_jax.numerics import with_own_numerics
 from ct_jax.pairs import Pairs, shortest_ways
 from ct_jax.prm import PlanTable, PrmConfig, build_roadmap, draw_joined, extend, extend_by_pairs, stack_tables
-from ct_jax.types import End, Frame, Observation, OnProgress, Policy, Privileged, Rollout, Steps, Tasks
+from ct_jax.rollout import as_frame, run
+from ct_jax.runtime.devices import data_mesh, fill_up, joined, largest, own, own_rows, place, sharded
+from ct_jax.runtime.interrupts import raise_if_interrupted
+from ct_jax.runtime.numerics import with_own_numerics
+from ct_jax.types import End, OnProgress, Policy, Rollout, Tasks
 
 _CHUNK = 25  # steps that are compiled into one program
 _DENSE = PrmConfig(samples=1000)  # for the lengths of the shortest ways
@@ -225,54 +224,3 @@ def start_episodes(env: MazeEnv, keys: jax.Array, maze: Maze, start: Any, goal: 
 @functools.partial(jax.jit, static_argnums=0)
 def _reset(env: MazeEnv, keys: jax.Array, maze: Maze, episodes: Episodes) -> State:
     return jax.vmap(env.reset)(keys, maze, episodes)
-
-
-def as_frame(state: State) -> Frame:
-    """What the interfaces say of a state of ``MazeEnv``."""
-    obs: dict[str, jax.Array] = state.obs  # pyright: ignore[reportAssignmentType]
-    info = state.info
-    return Frame(
-        Observation(obs.get("map"), obs["proprio"], obs["goal"]), state.reward, state.done > 0,
-        Privileged(info["position"], info["goal"], info["collision"], info["maze"]),
-    )  # fmt: skip
-
-
-@functools.partial(jax.jit, static_argnames=("env", "length", "mesh"))
-def run(
-    env: MazeEnv, policy: Policy, state: State, memory: Any, key: jax.Array, length: int, mesh: Mesh | None = None
-) -> tuple[State, Any, Steps]:
-    """Step N environments ``length`` times (static). Without auto-reset, an environment stays in its final state.
-
-    Args:
-        mesh: the devices that share the environments evenly. The result does not depend on it.
-    """
-    step: Callable = jax.vmap(env.step)
-    if mesh is not None and mesh.size > 1:  # each device steps its share: XLA cannot split the calls of MuJoCo itself
-        spec = sharded(mesh).spec
-        step = jax.shard_map(step, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-
-    def once(carry: tuple[State, Any], key: jax.Array) -> tuple[tuple[State, Any], Steps]:
-        state, memory = carry
-        frame = as_frame(state)
-        action, memory = policy.act(memory, frame, key)
-        after = step(state, action.executed)
-        # One number that is not finite, in a past action or in a label, would spoil all that is learned from them.
-        usable = jnp.all(jnp.isfinite(action.label), -1)
-        record = Steps(
-            position=frame.privileged.position,
-            proprio=frame.obs.proprio,
-            action=jnp.where(jnp.isfinite(action.intended), action.intended, 0.0),
-            label=jnp.where(usable[:, None], action.label, 0.0),
-            label_mask=jnp.where(usable, action.label_mask, 0.0),
-            reward=after.reward,
-            alive=1.0 - state.done,
-            collision=after.info["collision"],
-            success=after.info["success"],
-            target_return=action.target_return,
-        )  # pyright: ignore[reportArgumentType]
-        return (after, memory), record
-
-    (state, memory), steps = jax.lax.scan(once, (state, memory), jax.random.split(key, length))
-    if mesh is not None:
-        steps = jax.lax.with_sharding_constraint(steps, sharded(mesh, axis=1))
-    return state, memory, steps

@@ -10,26 +10,33 @@ from typing import Any
 import numpy as np
 
 from ct_envs import UserError
-from ct_envs.robots import TURTLEBOT3
-from ct_envs.turtlebot3 import MAX_NOISE
+from ct_envs.robots import TURTLEBOT3, Robot
+from ct_envs.turtlebot3 import ACTION_SIZE, MAX_NOISE, PROPRIO_SIZE
 from ct_envs.turtlebot3_world import World as Room
 from ct_envs.turtlebot3_world import load_world
-from ct_jax.checkpoint import write_json
 from ct_jax.controller import ControllerConfig
 from ct_jax.controllers.differential_drive import DifferentialDrive
 from ct_jax.evaluate import Episodes, check_horizon
 from ct_jax.model import TrainedModel
 from ct_jax.pairs import Pairs, horizon_for
-from ct_jax.progress import Metrics
-from ct_jax.run import Run, cores
+from ct_jax.runtime.checkpoint import write_json
+from ct_jax.runtime.progress import Metrics
+from ct_jax.runtime.run import Run, cores
 from ct_jax.settings import MAX_FACTOR, MAX_WORLDS, RoomConfig, controller_config
 from ct_jax.worlds import Trial
 from ct_jax.worlds.rooms import PLANNER, RoomWorld, evaluation_rooms
 
+KNOWN_CONTROLLER = DifferentialDrive()
 NAME = "rooms"  # of all rooms of an evaluation together, where a maze's name stands
 MAX_PAIRS = 1000
 SEVEN_SEED = 7  # of the seven pairs
 _SLOTS = 50  # episodes of an evaluation at a time
+
+
+def sizes(robot: Robot) -> tuple[int, int]:
+    """Entries of a robot's proprioception and of its action."""
+    del robot
+    return PROPRIO_SIZE, ACTION_SIZE
 
 
 @contextmanager
@@ -47,7 +54,7 @@ def open_training(run: Run, *, maps: bool) -> Iterator[RoomWorld]:
 def controller(run: Run, metrics: Metrics) -> tuple[DifferentialDrive, ControllerConfig]:
     """The known controller (paper, sec. IV-B)."""
     del metrics
-    return DifferentialDrive(), controller_config(run.settings)
+    return KNOWN_CONTROLLER, controller_config(run.settings)
 
 
 def trials(run: Run, folder: Path) -> Iterator[Trial]:

@@ -21,10 +21,10 @@ from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
 from ct_jax.collect import CollectConfig
 from ct_jax.guides.lidar_explorer import LidarExplorer
 from ct_jax.guides.room_roadmap import ShortcutGuide, WayGuide
-from ct_jax.interrupts import raise_if_interrupted
-from ct_jax.numerics import with_own_numerics
 from ct_jax.pairs import Pairs, shortest_ways
 from ct_jax.prm import NoPath, PrmConfig, Roadmap, build_roadmap, joins
+from ct_jax.runtime.interrupts import raise_if_interrupted
+from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.trajectories import pack_maps
 from ct_jax.types import End, Frame, Guide, Observation, OnProgress, Policy, Privileged, Rollout, Steps, Tasks
 

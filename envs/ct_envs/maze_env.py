@@ -115,11 +115,6 @@ class MazeState(State):
 jax.tree_util.register_dataclass(MazeState, [*State.__dataclass_fields__], [])
 
 
-def broke_off(info: dict[str, Any]) -> Float[Array, "*b"]:
-    """1 where an episode ended by a fall or because something was not finite, else 0. (The last step's ``info``.)"""
-    return jnp.maximum(info["fall"], info["diverged"])
-
-
 class MazeEnv(Env):
     """Reach the goal. The reward is minus the distance to the goal after the step [m] (paper, sec. III-G).
 
@@ -168,7 +163,7 @@ class MazeEnv(Env):
         """
         if maze is not None:
             _check_maze(maze, cell_m, boxes_of(maze))
-        self.robot = get_robot(robot, "maze") if isinstance(robot, str) else robot
+        self.robot = get_robot(robot, "mujoco") if isinstance(robot, str) else robot
         self.engine = make_engine(engine, self.robot, cell_m=cell_m, boxes=0 if maze is None else boxes_of(maze))
         self.maze, self.map_cell_m, self.maps, self.auto_reset = maze, map_cell_m, maps, auto_reset
         self.horizon = horizon or self.robot.horizon

@@ -29,7 +29,7 @@ class Robot:
     height_min_m: float | None = None  # the robot has fallen if the torso is lower than this
     controller_reward: Literal["velocity", "distance"] = "velocity"  # "velocity" or "distance" (paper, sec. III-G)
     has_heading: bool = False  # the torso has a free joint, so the robot has a heading, which is random after a reset
-    course: Literal["maze", "room"] = "maze"  # its world: a "maze" in MuJoCo, or a cluttered "room" in PyBullet
+    simulator: Literal["mujoco", "pybullet"] = "mujoco"  # and so its world: mazes, or cluttered rooms in PyBullet
 
     @property
     def reach_m(self) -> float:
@@ -93,17 +93,17 @@ TURTLEBOT3 = Robot(
     way_m=9.0,
     cruise_mps=0.2,
     goal_tolerance_m=0.2,
-    course="room",
+    simulator="pybullet",
 )
 
 ROBOTS = {robot.name: robot for robot in (POINT, ANT, HUMANOID, TURTLEBOT3)}
 
 
-def get_robot(name: str, course: str | None = None) -> Robot:
-    """The robot with this name. Raises UserError with the valid names (of a ``course``, if given)."""
-    known = [robot.name for robot in ROBOTS.values() if course in (None, robot.course)]
+def get_robot(name: str, simulator: str | None = None) -> Robot:
+    """The robot with this name. Raises UserError with the valid names (of a ``simulator``, if given)."""
+    known = [robot.name for robot in ROBOTS.values() if simulator in (None, robot.simulator)]
     if name not in known:
-        where = f" for a {course}" if course else ""
+        where = f" in {simulator}" if simulator else ""
         raise UserError(f"no robot named {shown(name)}{where}; robots: {', '.join(known)}")
     return ROBOTS[name]
 

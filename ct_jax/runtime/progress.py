@@ -16,10 +16,10 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.summary import scalar
 
-from ct_jax.devices import is_first
-from ct_jax.files import append_to, make_folder
-from ct_jax.interrupts import raise_if_interrupted
-from ct_jax.terminal import one_line
+from ct_jax.runtime.devices import is_first
+from ct_jax.runtime.files import append_to, make_folder
+from ct_jax.runtime.interrupts import raise_if_interrupted
+from ct_jax.runtime.terminal import one_line
 
 PLAIN_EVERY_S = 15.0  # without a terminal, interval of progress lines
 

@@ -27,11 +27,12 @@ import jax
 from ct_envs import Maze, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
 from ct_envs.maze import draw_walls, unpadded
 from ct_envs.robots import Robot, get_robot
-from ct_jax import __version__, devices
-from ct_jax.checkpoint import Checkpoints, read_json, write_json
+from ct_jax import __version__
 from ct_jax.evaluate import Episodes
-from ct_jax.files import append_to, check_folders, drop_parts, make_folder, save_arrays
-from ct_jax.progress import Bar, Metrics
+from ct_jax.runtime import devices
+from ct_jax.runtime.checkpoint import Checkpoints, read_json, write_json
+from ct_jax.runtime.files import append_to, check_folders, drop_parts, make_folder, save_arrays
+from ct_jax.runtime.progress import Bar, Metrics
 from ct_jax.settings import Settings, from_dict, to_dict
 
 _ROW = {"method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "collision_rate", "steps_mean"}
@@ -249,7 +250,7 @@ def default_mazes(robot: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     Raises:
         UserError: the robot is unknown.
     """
-    if get_robot(robot).course != "maze":
+    if get_robot(robot).simulator != "mujoco":
         return (), ()
     return ("antmaze-large",), ("antmaze-large-eval", "hall") if robot == "humanoid" else ("antmaze-large-eval",)
 

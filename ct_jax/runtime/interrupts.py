@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from ct_jax.terminal import one_line
+from ct_jax.runtime.terminal import one_line
 
 GRACE_S = 4.0  # time from SIGTERM until the thread saves; SIGKILL often follows after ten seconds
 _CALLBACKS = ("ct_envs.host_call", "jax._src.callback")

@@ -24,7 +24,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ct_envs import UserError
-from ct_jax import interrupts
+from ct_jax.runtime import interrupts
 
 Tree = TypeVar("Tree")
 T = TypeVar("T")

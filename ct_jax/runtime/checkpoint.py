@@ -23,10 +23,10 @@ from safetensors.numpy import save
 
 from ct_envs import UserError
 from ct_envs.checked import shown
-from ct_jax import devices
-from ct_jax.files import check_folders, make_folder, whole, write_text
-from ct_jax.interrupts import rescued_by, uninterrupted
-from ct_jax.terminal import printable
+from ct_jax.runtime import devices
+from ct_jax.runtime.files import check_folders, make_folder, whole, write_text
+from ct_jax.runtime.interrupts import rescued_by, uninterrupted
+from ct_jax.runtime.terminal import printable
 
 Tree = TypeVar("Tree")
 SAVE_EVERY_S = 60.0

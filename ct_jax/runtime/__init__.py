@@ -1,0 +1,1 @@
+"""What every program needs: run folders, checkpoints, devices, files, progress, interrupts, compilation."""
