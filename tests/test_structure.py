@@ -9,24 +9,12 @@ import pytest
 import ct_jax
 
 ROOT = Path(__file__).parents[1]
-# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here. A part with a place of its
-# own counts as a stage.
+# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here. A part that is listed
+# counts as a stage.
 ORDER = [
-    *[
-        "runtime",
-        "types",
-        "worlds",
-        "rollout",
-        "learner",
-        "prm",
-        "guides",
-        "pairs",
-        "trajectories",
-        "guided",
-        "collect",
-    ],
-    *["controllers", "controller", "dense", "transformer", "heads", "value", "fit", "policy", "agent", "evaluate"],
-    *["finetune", "baselines", "transfer", "settings", "configs", "model", "runtime.run", "report"],
+    *["runtime", "types", "worlds", "rollout", "learner", "prm", "guides", "pairs", "trajectories", "guided"],
+    *["collect", "controllers", "controller", "dense", "transformer", "heads", "value", "fit", "policy", "agent"],
+    *["evaluate", "finetune", "baselines", "transfer", "settings", "configs", "model", "runtime.run", "report"],
     *["worlds.mazes", "worlds.rooms", "worlds.maze_runs", "worlds.room_runs", "pipeline", "cli"],
 ]
 # What steps robots, and the worlds that hold it.
