@@ -17,6 +17,7 @@ from ct_envs.fine import fit_maze, load_fitted, merge_walls, wall_distance
 from ct_envs.maze import clearance, load_walls, sample_pair, segment_free, segment_reach
 from ct_envs.occupancy import local_map
 from ct_envs.physics import PhysicsState, add_wall, make_engine, model_xml, nearest_walls
+from tests.refusals import refusal
 
 pytestmark = pytest.mark.rank_promotion("allow")  # MJX
 
@@ -27,15 +28,6 @@ GRIDS = st.builds(
     ),
     st.integers(0, 2**31 - 1), st.integers(3, 30), st.integers(3, 30), st.floats(0, 0.9),
 )  # fmt: skip
-
-
-def refusal(call) -> str:
-    """The single line with which a call is refused."""
-    with pytest.raises(UserError) as refused:
-        call()
-    message = str(refused.value)
-    assert message and message.splitlines() == [message], message
-    return message
 
 
 def speckled(seed: int, cell_m: float) -> np.ndarray:

@@ -17,6 +17,7 @@ from ct_envs import UserError, load_maze, random_walls
 from ct_envs.maps import MAX_MAP_SIDE, Map, converted, in_words, png_of, read_map, small_picture
 from ct_envs.maze import draw_walls, load_walls
 from ct_jax.cli import main
+from tests.refusals import refusal
 
 GRIDS = st.builds(
     lambda seed, height, width, density: random_walls(seed, height=height, width=width, density=density),
@@ -26,15 +27,6 @@ PLAIN = {
     "image": "floor.pgm", "resolution": "0.05", "origin": "[0, 0, 0]", "negate": "0", "occupied_thresh": "0.65",
     "free_thresh": "0.196",
 }  # fmt: skip
-
-
-def refusal(call) -> str:
-    """The single line with which a call is refused."""
-    with pytest.raises(UserError) as refused:
-        call()
-    message = str(refused.value)
-    assert message and message.splitlines() == [message], message
-    return message
 
 
 def pgm(grey: np.ndarray) -> bytes:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ct_envs import UserError, load_maze, make_maze, random_walls
 from ct_envs.maze import draw_walls, load_walls, parse_walls
+from tests.refusals import refusal
 
 GYMNASIUM = [  # a map as Gymnasium-Robotics has it: first row on top, "r" for resets, "g" for goals
     [1, 1, 1, 1, 1, 1, 1, 1],
@@ -24,15 +25,6 @@ GRIDS = st.builds(
     lambda seed, height, width, density: random_walls(seed, height=height, width=width, density=density),
     st.integers(0, 2**31 - 1), st.integers(5, 9), st.integers(5, 9), st.floats(0, 1),
 )  # fmt: skip
-
-
-def refusal(call) -> str:
-    """The single line with which a call is refused."""
-    with pytest.raises(UserError) as refused:
-        call()
-    message = str(refused.value)
-    assert message and message.splitlines() == [message], message
-    return message
 
 
 # --------------------------------------------------------------------------------------------------- nested lists
