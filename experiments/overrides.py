@@ -1,4 +1,9 @@
-"""Overrides that the variants of several robots share. The robots' files list the variants."""
+"""Variants that robots in mazes share. Each robot's file gives what differs between the robots."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from study import Variant, half_the_updates, pt_cql_config, sac_alone_config
 
 BC = {"model.returns": False}
 # No fine-tuning. One training with all updates, and randomly shifted timesteps.
@@ -16,3 +21,39 @@ MAZES = {
     "last_fit.updates": 2400, "last_fit.shift_timestep": 300,
 }  # fmt: skip
 MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
+
+
+def maze_variants(
+    robot: str, *, frame: str, bumps: int, memory: Mapping[str, Any], skill: Mapping[str, Any] | None = None
+) -> dict[str, Variant]:
+    """The variants of a robot in mazes, by name.
+
+    Args:
+        frame: of the baseline PT-CQL.
+        bumps: steps with a collision that count as a failure, as published.
+        memory: overrides for a memory of longer duration.
+        skill: overrides for the low-level controller as the action head; without them, no variant has it.
+    """
+    f_ct = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": bumps, "round_fit": half_the_updates}
+    found = {
+        "published": Variant("published", label="CT"),
+        "bc": Variant("published", BC, label="BC-CT"),
+        "f-ct": Variant("published", f_ct, label="F-CT", tuned_from="published"),
+        "pt-cql": Variant("published", label="PT-CQL", baseline=pt_cql_config(frame)),
+        "sac": Variant("published", label="SAC alone", baseline=sac_alone_config(robot)),
+    }
+    lifted = {"cpu": {}, "mazes": MAZES, "modes": MODES, "calm": CALM, "memory": memory}
+    lifted |= {} if skill is None else {"skill": skill}
+    lifted["calm+memory"] = {**CALM, **memory}
+    lifted |= {} if skill is None else {"calm+memory+skill": {**CALM, **memory, **skill}}
+    lifted |= {"long": LONG, "calm+long": LONG | CALM}
+    without_tuning = {"mazes": MAZES_CT, "modes": MODES_CT, "long": LONG_CT, "calm+long": LONG_CT | CALM}
+    for name, tuned in lifted.items():
+        found[f"{name}-ct"] = Variant("cpu", without_tuning.get(name, {**CT, **tuned}))
+        found[name] = Variant("cpu", tuned, tuned_from=f"{name}-ct")
+    return found | {
+        "roam": Variant("cpu", ROAM, tuned_from="cpu-ct"),
+        "modes+roam": Variant("cpu", MODES | ROAM, tuned_from="modes-ct"),
+        "modes+memory-ct": Variant("cpu", {**MODES_CT, **memory}),
+        "modes+memory+roam": Variant("cpu", {**MODES, **memory, **ROAM}, tuned_from="modes+memory-ct"),
+    }
