@@ -1,7 +1,7 @@
 """Control Transformer in JAX: robot navigation in unknown mazes, learned from roadmap-guided trajectories.
 
 A name is imported when it is first used, so that ``import ct_jax`` alone is quick. No public name is that of a
-submodule: ``ct_jax.collect`` and ``ct_jax.evaluate`` are modules, whatever is imported first.
+submodule: ``ct_jax.collect`` and ``ct_jax.evaluate`` are always modules.
 """
 
 from importlib import import_module

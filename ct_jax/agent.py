@@ -1,4 +1,4 @@
-"""A trained policy that acts on observations of one's own: of another simulator, a recording, or a robot."""
+"""A trained policy that acts on your own observations: of another simulator, a recording, or a robot."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -67,7 +67,7 @@ def collect(
     """Algorithm 3: guide pi_c until T episodes have succeeded; only successes are kept.
 
     Args:
-        guide: a planner of one's own, in place of the world's with the name ``config.guide``.
+        guide: your own planner; by default the world's planner with the name ``config.guide``.
         on_progress: called with (successes, episodes) so far.
         keep: see ``kept_in``.
 

@@ -1,4 +1,4 @@
-"""Dense layers and dropout as a training on CPU wants them: elsewhere they are as good as any."""
+"""Dense layers and dropout that are fast on CPU. On accelerators they are as fast as those of flax."""
 
 from collections.abc import Callable
 

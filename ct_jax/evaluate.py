@@ -38,8 +38,8 @@ class Episodes:
     horizon: int  # control steps of an episode
     target_return: np.ndarray | None = None  # return that the policy was conditioned on at the start
     proprio: np.ndarray | None = None  # float32 [T, P]: of the first episode, for a video
-    frontal: np.ndarray | None = None  # bool [n]: ran into something, where that is told from ...
-    grazing: np.ndarray | None = None  # ... bool [n]: touched something with its side
+    frontal: np.ndarray | None = None  # bool [n]: frontal collision, where the world distinguishes it from
+    grazing: np.ndarray | None = None  # bool [n]: a touch with the robot's side
     not_joined: int | None = None  # of a planner: pairs that its roadmap does not join
     beyond: int = 0  # pairs too far apart for the robot to make within the horizon
     diverged: np.ndarray | None = None  # bool [n]: a state or action was not finite, where that ends an episode
@@ -105,7 +105,7 @@ def evaluate(
     Args:
         world: with local maps.
         pairs: ``world.draw_pairs``, or one's own.
-        method: "planner" (it has the full map and needs ``controller``), "explorer" (it sees local maps, likewise), or
+        method: "planner" (has the full map), "explorer" (sees local maps); both need ``controller``; or
             any name for ``policy``.
         prm: the planner's roadmap, and its margins.
         horizon: control steps of an episode; by default the world's.

@@ -139,8 +139,8 @@ def recover(
         world: with local maps.
         collecting: gives starts, guide, noise, reset interval, number of episodes at a time, and the horizon of a
             recovery; the failure before it has ``config.patience`` steps more.
-        guide: a planner of one's own. By default the collection's, but "shortcut" for "roadmap": it recovers from
-            anywhere.
+        guide: your own planner; by default that of the collection, with "shortcut" in place of "roadmap", because it
+            recovers from any position.
         keep: see ``collect.kept_in``.
 
     Returns:

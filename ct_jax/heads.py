@@ -52,8 +52,8 @@ class HeadingHead(nn.Module):
 class SkillHead(nn.Module):
     """Actions of the trained low-level controller. For each mode, the trunk gives it a goal in the world's plane.
 
-    For a body so easily brought down that a head of one's own, which learns a gait from examples, falls. The weights
-    lie in the collection "skill", see ``with_skill``, and get no gradient.
+    It is for robots that fall easily, such as the humanoid: a head that learns the gait from examples falls. The
+    weights are in the collection "skill" (see ``with_skill``) and get no gradient.
     """
 
     controller: ControllerConfig

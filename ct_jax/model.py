@@ -52,7 +52,7 @@ class TrainedModel:
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
     def agent(self) -> Agent:
-        """The policy for observations of one's own."""
+        """The policy, for your own observations."""
         return Agent(self.policy, self.robot, sizes(self.robot)[0])
 
 

@@ -47,7 +47,7 @@ def train(run: Run, *, resume: bool = False) -> Path:
         KeyboardInterrupt: Ctrl-C; ``resume`` goes on from there.
     """
     _check_processes(run.spec)
-    from ct_jax.report import write_report  # matplotlib, which takes its time and has its say about folders
+    from ct_jax.report import write_report  # imports matplotlib, which is slow
 
     with open_run(run, resume=resume):
         metrics = Metrics(run.folder)
@@ -121,7 +121,7 @@ def describe(data: Trajectories) -> dict[str, Any]:
 def _fit(
     run: Run, controller: Any, config: ControllerConfig, data: Trajectories, metrics: Metrics
 ) -> TransformerPolicy:
-    """Value network and transformer, from scratch but for a skill that it is given."""
+    """Train value network and transformer from scratch. A head that is the low-level controller is not trained."""
     policy, _ = blank_model(run.robot, with_controller(run.settings, config))
     if run.settings.model.skill:
         policy = replace(policy, params=with_skill(policy.params, controller))
@@ -266,7 +266,7 @@ def evaluate_model(
     """Evaluate one method of a run folder or zoo model; returns its row of the table.
 
     Args:
-        keep: told the row as soon as it is there, before anything is drawn.
+        keep: called with the row as soon as it is complete, before pictures are drawn.
         return_scale: k, in place of the model's own.
         options: of the ``Request`` of the robot's kind of world.
 

@@ -93,7 +93,7 @@ def with_fits(settings: Settings, **changes: Any) -> Settings:
 FORMAT: Final = 3  # of settings in files; a file without a number is of format 1
 
 # Format 1 had other names, and left settings out that came after its first version, where they had these values. The
-# values stay what they are, whatever the defaults become. In format 2, "sac" was one object: see ``_settings_2``.
+# values do not change when the defaults change. In format 2, "sac" was one object: see ``_settings_2``.
 _NAMES_1 = {
     "optimism": "return_scale", "reprompt": "clip_target_return", "controller_effort": "controller_action_scale",
     "effort": "action_scale",

@@ -284,7 +284,7 @@ class ControlTransformer(nn.Module):
         mask = mask[None] & (jnp.repeat(valid, n, 1) > 0)[:, None, :] | jnp.eye(n * steps, dtype=bool)[None]
         for block in self.blocks[:-1]:
             x = block.attend(x, *block.heads(x), mask, deterministic)
-        # Of the last block only the state tokens are asked for anything.
+        # Only the outputs of the state tokens are used, so the last block computes only these.
         q, k, v = self.blocks[-1].heads(x)
         states = slice(1, None, n)
         x = self.blocks[-1].attend(x[:, states], q[:, states], k, v, mask[:, states], deterministic)

@@ -173,7 +173,7 @@ class World(Protocol):
     """Where robots drive."""
 
     robot: Robot
-    horizon: int  # control steps of an episode, where nothing else is asked for
+    horizon: int  # default number of control steps of an episode
     places: int  # number of mazes that tasks are drawn in, one after the other; 1 if each room is new
 
     def sample_tasks(self, key: jax.Array, config: Any, prm: Any, *, first: int = 0, offset: int = 0) -> Tasks:

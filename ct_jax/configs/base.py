@@ -43,7 +43,7 @@ CPU = replace(
     round_fit=replace(_LIFTED, updates=300, warmup=20),
     last_fit=replace(_LIFTED, updates=2500, warmup=20, decay=True),
 )
-"""What lifts the method on two CPU cores: a teacher that knows no more than its pupil, free starts, disturbances,
+"""The lifted method for two CPU cores: the teacher is a planner that sees only local maps; free starts; disturbances;
 mirrored worlds, and recoveries in which the planner's action is imitated at every step."""
 
 DEMO = replace(

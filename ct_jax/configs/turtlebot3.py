@@ -49,10 +49,10 @@ CPU = replace(
     last_fit=replace(_LIFTED, updates=4000),
     clip_target_return=True,
 )
-"""What lifts it: a teacher that knows no more than its pupil, and passes obstacles with room to spare; five seconds of
-memory instead of one, in which it does not see, and so does not repeat, what it did itself; free starts, disturbances,
-mirrored rooms, relabelled recoveries in six rounds; and with its rate raised and then lowered, training takes half the
-updates."""
+"""The lifted method. The teacher is a planner that sees only the lidar and keeps a margin to obstacles. The memory has
+five seconds instead of one, without past actions, so that the policy does not copy them. Starts are free, actions are
+disturbed, and rooms are mirrored. Six rounds relabel recoveries. A learning rate that rises and then falls halves the
+number of updates."""
 
 DEMO = replace(
     CPU,

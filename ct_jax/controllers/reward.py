@@ -19,17 +19,19 @@ Ramp = tuple[Share, Share]  # begin and end of a change, in shares of the traini
 
 @dataclass(frozen=True)
 class RewardConfig(Checked):
-    """The terms of the reward besides the way that is made or left."""
+    """The terms of the reward in addition to progress or distance."""
 
-    arrival_bonus: Metres = 10.0  # for reaching the goal; without it, staying away would earn entropy for ever
-    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # a fall costs as much as lying for ever this much farther away [m]:
-    # at first, while every attempt to walk ends in a fall, and later; with 60 m the ant stood still
+    arrival_bonus: Metres = (
+        10.0  # for reaching the goal; without it, the entropy bonus would make it better to stay away
+    )
+    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # cost of a fall: the value of staying this much farther away [m],
+    # at the beginning and at the end of training; with 60 m from the beginning, the ant does not learn to walk
     fall_ramp: Ramp = (0.2, 0.5)  # the change of ``fall_m``
-    alive_bonus: Metres = 0.0  # of each step without a fall (paper, for the humanoid); then a fall has no other cost
-    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # velocity reward: a higher speed towards the goal earns
-    # no more than this one
+    alive_bonus: Metres = 0.0  # reward of each step without a fall (paper, humanoid); replaces the cost of a fall
+    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # velocity reward: speeds towards the goal
+    # above this one get no more reward
     action_cost: Metres = 0.0  # cost of a step with all actuators at their limits
-    tilt_m: Metres = 0.0  # a torso on its side costs as much as being this much farther away [m]
+    tilt_m: Metres = 0.0  # cost of a torso that lies on its side: that of this distance [m]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,7 +78,7 @@ class Reward:
         return jnp.minimum((before_m - after_m) / self.control_dt_s, self.config.speed_mps or jnp.inf)
 
     def pay_falls(self, batch: Transition, share: Float[Array, ""], discount: float) -> Transition:
-        """The batch with the cost of falls: as much as lying for ever, ``fall_m`` farther away.
+        """The batch with the cost of falls: the value of staying ``fall_m`` farther away for ever.
 
         Without this cost, a fall far from the goal would pay off: it ends the negative rewards. With an alive bonus the
         rewards are gains, and a fall ends them.

@@ -34,11 +34,11 @@ class Request(Protocol):
         ...
 
     def open(self, model: Any, seed: int) -> AbstractContextManager[Trial]:
-        """What is asked for. Raises UserError."""
+        """The requested places and pairs. Raises UserError."""
         ...
 
     def show(self, trial: Trial, title: str, episodes: Any) -> None:
-        """Write the pictures that are asked for."""
+        """Write the requested pictures."""
         ...
 
 

@@ -111,7 +111,7 @@ def _head(maze: str, episodes: int, seed: int) -> dict[str, Any]:
 
 
 def _stored_pairs(world: MazeWorld, file: Path, run: Run) -> Pairs:
-    """The evaluation's pairs: drawn once, written down, and read back ever after."""
+    """The pairs of the evaluation. They are drawn once and saved; later calls read the file."""
     seed = run.settings.pairs_seed
     found = devices.first(lambda: read_json(file) if file.is_file() else None)
     if found is not None:
@@ -182,7 +182,7 @@ class Request:
         """Write the picture and the video."""
         maze: Maze = jax.tree.map(lambda leaf: leaf[0], trial.world.mazes)  # pyright: ignore[reportAttributeAccessIssue]
         if self.picture is not None and devices.is_first():
-            from ct_jax.report import pictures  # likewise
+            from ct_jax.report import pictures  # imports matplotlib
 
             reached = f"{int(episodes.success.sum())} of {len(episodes.success)} reached the goal"
             pictures.write_paths(self.picture, unpadded(maze), episodes, f"{title}: {reached}")

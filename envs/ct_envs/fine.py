@@ -44,7 +44,7 @@ def load_fitted(name_or_file: str | Path, robot: Robot) -> Maze:
 
 
 def fit_maze(walls: Bool[np.ndarray, "h w"], robot: Robot, *, cell_m: float) -> Maze:
-    """A maze for one robot, whatever the size of its cells.
+    """A maze for one robot, with cells of any size.
 
     A robot that reaches less than half a cell in a step gets the maze of ``make_maze``. For any other, the maze has
     ``boxes``, and its free cells are those at whose centre the robot has room, with a margin of up to two cells.

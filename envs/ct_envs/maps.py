@@ -31,7 +31,7 @@ _WALL_FROM = 50  # a cell at least so likely occupied [%] is wall
 MAX_MAP_SIDE = 8192  # most cells along a side of a map
 LEAST_CELL_M, MOST_CELL_M = 0.001, 100.0
 MODES = ("trinary", "scale", "raw")
-_HEAD = 4096  # bytes from which the kind of a file is told
+_HEAD = 4096  # number of bytes that determine the kind of a file
 _MOST_MAZE_BYTES = 8 * MAX_SIDE * (MAX_SIDE + 2)  # as JSON with each cell on a line of its own
 _MOST_YAML_BYTES = 1 << 16
 _SAVED_UNKNOWN = 205  # the grey that map savers write for unknown space
@@ -447,7 +447,7 @@ def _load_picture(path: Path) -> Pixels:
         raise
     except Image.DecompressionBombError:
         raise UserError(f"{path}: too large a picture; {limit}") from None
-    except Exception as bad:  # whatever decoders say of broken files
+    except Exception as bad:  # decoders raise many kinds of errors for broken files
         why = "" if isinstance(bad, Image.UnidentifiedImageError) else f" ({shown(str(bad))})"
         mend = "save it as PGM, PNG, BMP or JPEG"
         raise UserError(f"{path}: cannot be read as a picture{why}; {mend}") from None

@@ -109,7 +109,7 @@ def get_robot(name: str, simulator: str | None = None) -> Robot:
 
 
 def register(robot: Robot) -> Robot:
-    """Make a robot of one's own known by its name, and return it. Raises UserError if another robot has that name."""
+    """Register your own robot under its name, and return it. Raises UserError if another robot has that name."""
     if ROBOTS.setdefault(robot.name, robot) != robot:
         raise UserError(f"there is another robot named {shown(robot.name)}; give yours a name of its own")
     return robot
