@@ -47,8 +47,8 @@ class TrainedModel:
 
     robot: str
     settings: Settings
-    policy: TransformerPolicy
-    controller: SacController | DifferentialDrive  # learned, as the settings describe it, or known
+    policy: Any  # a ``TransformerPolicy``, or what a baseline learned
+    controller: SacController | DifferentialDrive | None  # learned, as the settings describe it, or known
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
     def agent(self) -> Agent:
@@ -251,7 +251,7 @@ def _blank_sac(robot: str, config: ControllerConfig) -> SacController:
     return jax.eval_shape(lambda key: blank_controller(key, *sizes(robot), config), jax.random.key(0))
 
 
-def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive) -> dict[str, Any]:
+def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive | None) -> dict[str, Any]:
     arrays = {"transformer": policy.params, "value": policy.value_params}
     if isinstance(controller, SacController):
         arrays |= {"normalizer": controller.normalizer, "controller": controller.policy}

@@ -10,7 +10,7 @@ time on two cores; ``--controller zoo`` uses the shipped controller. ``zoo:ant``
 """
 
 from overrides import BC, CALM, CT, LONG, LONG_CT, MAZES, MAZES_CT, MODES, MODES_CT, ROAM
-from study import Variant, half_the_updates, main, pt_cql_config, sac_alone_config
+from study import Variant, baseline_config, half_the_updates, main
 
 F_CT = {"rounds": 1, "recover.recoveries": 500, "recover.bumps": 40, "round_fit": half_the_updates}
 MEMORY = {"model.stride": 3}  # the memory holds every third step
@@ -23,8 +23,8 @@ VARIANTS = {
     "published": Variant("published", label="CT"),
     "bc": Variant("published", BC, label="BC-CT"),
     "f-ct": Variant("published", F_CT, label="F-CT", tuned_from="published"),
-    "pt-cql": Variant("published", label="PT-CQL", baseline=pt_cql_config("heading")),
-    "sac": Variant("published", label="SAC alone", baseline=sac_alone_config("ant")),
+    "pt-cql": Variant("published", label="PT-CQL", baseline=baseline_config("pt-cql", "ant")),
+    "sac": Variant("published", label="SAC alone", baseline=baseline_config("sac", "ant")),
     "cpu-ct": Variant("cpu", CT),
     "cpu": Variant("cpu", tuned_from="cpu-ct"),
     "mazes-ct": Variant("cpu", MAZES_CT),

@@ -9,8 +9,8 @@ import pytest
 import ct_jax
 
 ROOT = Path(__file__).parents[1]
-# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here. A part with a place of its
-# own counts as a stage.
+# The stages of ct_jax. Each may import earlier stages and its own parts. Add new modules here. A part with a place of
+# its own counts as a stage.
 ORDER = [
     *[
         "runtime",
@@ -26,7 +26,7 @@ ORDER = [
         "collect",
     ],
     *["controllers", "controller", "dense", "transformer", "heads", "value", "fit", "policy", "agent", "evaluate"],
-    *["finetune", "baselines", "transfer", "settings", "configs", "model", "runtime.run", "report"],
+    *["finetune", "transfer", "settings", "configs", "model", "baselines", "runtime.run", "report"],
     *["worlds.mazes", "worlds.rooms", "worlds.maze_runs", "worlds.room_runs", "pipeline", "cli"],
 ]
 # What steps robots, and the worlds that hold it.
