@@ -85,7 +85,12 @@ def model_folder(run: str) -> Path:
     for folder in (Path(run) / "model", Path(run)):
         if (folder / "model.json").is_file():
             return folder
-    if (Path(run) / "config.json").is_file():
+    config = Path(run) / "config.json"
+    if config.is_file():
+        said = read_json(config, hint="restore it")
+        if "baseline" in said:
+            method = shown(said.get("method"), quoted=False)
+            raise UserError(f"{run}: a run of {method}, without a transformer; evaluate it with --method {method}")
         raise UserError(f"{run}: not trained to the end yet; continue it with: ct-jax train ... --out {run} --resume")
     raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or {_zoo_words()}")
 

@@ -380,14 +380,12 @@ def _load(where: str, method: str) -> TrainedModel:
     run = None
     if not (folder / "model" / "model.json").is_file() and (folder / "config.json").is_file():
         run = stored_run(folder)
-    if run is None or run.method in TRANSFORMERS:
+    if run is None or run.baseline is None or method in TRANSFORMERS:
         model = load_model(where)
         for name, value in TRANSFORMERS.get(method, {}).items():
             if getattr(model.settings.model, name) != value:
                 raise UserError(f"{where}: its transformer has not model.{name}={value}; give --method ct")
         return model
-    if method in TRANSFORMERS:
-        raise UserError(f"{where}: a run of {run.method}, without a transformer; give --method {run.method}")
     if not get_baseline(run.method).TRAJECTORIES:
         raise UserError(f"{where}: {run.method} has no low-level controller; give --method {run.method}")
     if kind_of(run.spec).KNOWN_CONTROLLER is None and run.done("controller") is None:

@@ -11,6 +11,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -392,9 +393,8 @@ def baseline_rows(run: Run, config: Checked, name: str = "") -> list[dict[str, A
     folder = run.folder / "baselines" / name
     with open_run(run, resume=True):
         (run.folder / "evaluate").mkdir(exist_ok=True)  # for the pairs
-        metrics = Metrics(run.folder)
-        policy, _ = pipeline.learned_baseline(run, config, metrics, name)
-        metrics.close()
+        with closing(Metrics(run.folder)) as metrics:
+            policy, _ = pipeline.learned_baseline(run, config, metrics, name)
         made = origin_of(read_json(folder / "baseline.json"))
         trials = kind_of(run.spec).trials(run, run.folder / "evaluate")
         rows = [pipeline.evaluated(run, folder, trial, name, policy=policy) for trial in trials]

@@ -3,9 +3,7 @@
 import contextlib
 import json
 import shutil
-from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -120,7 +118,9 @@ def test_a_method_is_trained_and_evaluated(method, command, tmp_path, capsys):
     assert guided or "sac has no low-level controller; give --method sac" in said.err
     if method != "bc-ct":
         assert cli.main(arguments) == cli.BAD_INPUT
-        assert f"a run of {method}, without a transformer; give --method {method}" in capsys.readouterr().err
+        assert (
+            f"a run of {method}, without a transformer; evaluate it with --method {method}" in capsys.readouterr().err
+        )
 
 
 @pytest.mark.parametrize("method", ["pt-cql", "sac"])
@@ -280,6 +280,3 @@ def test_a_new_baseline_is_one_file(command, tmp_path, monkeypatch, capsys):
     assert cli.main(["train", "point", "--method", "mine", "--help-all"]) == 0
     assert "how often nothing is learned" in capsys.readouterr().out
     assert mine.NAME == "mine"
-
-
-# ------------------------------------------------------------------------------------------------------------- rooms

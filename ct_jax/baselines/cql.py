@@ -43,11 +43,11 @@ TRAJECTORIES = True
 class CqlConfig(Checked):
     """Conservative Q-learning."""
 
-    updates: Count = 20_000
+    updates: Count = 20_000  # gradient updates
     batch: Annotated[int, Within(1, 1_000_000)] = 256  # number of single steps in a batch
     learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # of policy, critics and temperature
     width: Annotated[int, Within(1, 16_384)] = 128  # of all layers
-    discount: Share = 0.99
+    discount: Share = 0.99  # of the return, for each step
     reward_scale: Annotated[float, Above(0, 1_000_000)] = 0.1  # of the reward [m] in the critics' units
     alpha: Annotated[float, Within(0, 1_000_000)] = 5.0  # weight of the conservative penalty against the squared error
     # For the penalty: number of actions of each kind (uniform, policy at s, policy at s').

@@ -103,9 +103,13 @@ class ActorPolicy:
     def act(self, memory: tuple[()], frame: Frame, key: jax.Array) -> tuple[Action, tuple[()]]:
         """The next actions in N environments with maps, and the empty memory."""
         del key
-        actor = Actor(self.action_size, self.width, self.frame)
-        logits: Any = actor.apply(self.params, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))
-        return act_as_intended(tanh_gaussian(self.action_size).mode(logits)), memory
+        return act_as_intended(_best(self, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))), memory
+
+
+@jax.jit  # some worlds step in NumPy
+def _best(policy: ActorPolicy, seen: Seen) -> Float[Array, "N A"]:
+    logits: Any = Actor(policy.action_size, policy.width, policy.frame).apply(policy.params, seen)
+    return tanh_gaussian(policy.action_size).mode(logits)
 
 
 def blank_policy(robot: Robot, width: int, frame: FrameName) -> ActorPolicy:

@@ -44,7 +44,7 @@ class SacAloneConfig(Checked):
     """Settings of SAC alone."""
 
     sac: SacConfig = SacConfig()  # ``hidden[0]`` is the width of its networks
-    reward: RewardConfig = RewardConfig()
+    reward: RewardConfig = RewardConfig()  # terms of the reward
     frame: FrameName = "world"  # "heading": proprioception and actions are in the robot's own frame
 
     @property

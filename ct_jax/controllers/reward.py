@@ -22,12 +22,13 @@ class RewardConfig(Checked):
     """The terms of the reward besides the way that is made or left."""
 
     arrival_bonus: Metres = 10.0  # for reaching the goal; without it, staying away would earn entropy for ever
-    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # a fall costs as much as lying for ever this much farther away [m]:
-    # at first, while every attempt to walk ends in a fall, and later; with 60 m the ant stood still
+    # A fall costs as much as lying for ever this much farther away [m]: at first, while every attempt to walk ends in a
+    # fall, and later; with 60 m the ant stood still.
+    fall_m: tuple[Metres, Metres] = (5.0, 20.0)
     fall_ramp: Ramp = (0.2, 0.5)  # the change of ``fall_m``
     alive_bonus: Metres = 0.0  # of each step without a fall (paper, for the humanoid); then a fall has no other cost
-    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # velocity reward: a higher speed towards the goal earns
-    # no more than this one
+    # Velocity reward: a higher speed towards the goal earns no more than this one.
+    speed_mps: Annotated[float, Above(0, 1000)] | None = None
     action_cost: Metres = 0.0  # cost of a step with all actuators at their limits
     tilt_m: Metres = 0.0  # a torso on its side costs as much as being this much farther away [m]
 
