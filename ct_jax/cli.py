@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -35,6 +35,7 @@ from ct_jax.runtime.terminal import check_stdout, one_line, printable, show_anyt
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ct_envs.checked import Checked
     from ct_jax.settings import Settings
 
 PROGRAM = "ct-jax"
@@ -79,8 +80,10 @@ class Train:
       ct-jax train point --preset demo --resume
       ct-jax train point --maze my_floor.txt --maze hall --eval-maze my_other_floor.txt --out runs/mine
       ct-jax train ant --fit.updates 500 --model.width 256 --collect.noise 0.1
+      ct-jax train point --method pt-cql --baseline.updates 500
 
     Every setting of the method is an option. `ct-jax train ROBOT --help-all` lists them with the values of the preset.
+    With `--method`, it also lists the settings of that baseline.
 
     A maze file is plain text: '#' is a wall, '.' is free, and the border is closed. A cell is 4 m wide.
     """
@@ -91,8 +94,12 @@ class Train:
     """Size of the training: demo (minutes; longer for ant and humanoid), cpu (an hour on two cores; one or two hours
     more if ant or humanoid learn their own controller), published (the published method at the size of cpu) or paper
     (the published size; needs a GPU)."""
+    method: Annotated[str, arg(metavar="ct|bc-ct|pt-cql|sac")] = "ct"
+    """What to train: ct (the transformer) or a baseline: bc-ct (the transformer without returns), pt-cql (conservative
+    Q-learning on the same trajectories), sac (SAC in the whole maze, without planner and trajectories), or one of your
+    own."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/ROBOT-PRESET-SEED)")] = None
-    """Run folder."""
+    """Run folder. With another method than ct, its name is in the default, too: runs/ROBOT-METHOD-PRESET-SEED."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Random seed of the whole run."""
     maze: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME|FILE")] = ()
@@ -127,6 +134,7 @@ class Evaluate:
       ct-jax evaluate zoo:ant --maze unseen-rooms --episodes 1 --seed 3 --video rooms.mp4
       ct-jax evaluate zoo:turtlebot3 --worlds 20 --pairs 25 --density 1.5 --noise 1
       ct-jax evaluate zoo:point --seed 7 --return-scale 0.75
+      ct-jax evaluate runs/point-pt-cql-cpu-0 --method pt-cql
     """
 
     run: Annotated[Positional[str], arg(metavar="RUN")]
@@ -148,8 +156,9 @@ class Evaluate:
     maze is longer than in the paper's mazes, the default grows in proportion."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the start-goal pairs. All methods get the same pairs."""
-    method: Annotated[str, arg(metavar="ct|planner|explorer")] = "ct"
-    """ct (the transformer), planner (knows the full map) or explorer (maps what it sees, and plans on that map)."""
+    method: Annotated[str, arg(metavar="ct|planner|explorer|BASELINE")] = "ct"
+    """ct (the transformer), planner (knows the full map), explorer (maps what it sees, and plans on that map), or the
+    baseline that was trained in the run: bc-ct, pt-cql, sac."""
     return_scale: Annotated[float | None, arg(metavar="K", help_behavior_hint="(default: the model's)")] = None
     """The target return is K times the return that the value network predicts. Returns are negative, so K below 1 means
     conditioning on a higher return: faster episodes."""
@@ -340,20 +349,47 @@ def _in_one_line(parse: Callable[[], Any], see: str) -> Any:
         raise UserError(f"{_reason(said.read())}; see {see}") from None
 
 
-def _changed(settings: "Settings", command: Train, *more: str) -> "Settings":
-    """The settings of the preset, with the options of the command line in place of its values."""
+def _settings_of(command: Train, *more: str) -> tuple["Settings", "Checked | None"]:
+    """The settings of the preset and those of the method's baseline, if it is one, with the options in their place.
+
+    Raises:
+        UserError: the robot, the preset or the method is unknown, or an option is wrong.
+    """
+    from ct_jax.baselines import TRANSFORMERS, check_method, get_baseline
+    from ct_jax.configs import find_robot, get_preset
     from ct_jax.settings import Settings
 
-    def parse() -> Settings:
+    check_method(command.method)
+    settings = get_preset(command.preset, command.robot)
+    settings = replace(settings, model=replace(settings.model, **TRANSFORMERS.get(command.method, {})))
+    if command.method in TRANSFORMERS:
+        return _changed(AvoidSubcommands[Settings], settings, command, *more), None
+    baseline = get_baseline(command.method)
+    # The defaults of the baseline depend on the settings, so these are parsed first, and then all together.
+    settings, _ = _changed(AvoidSubcommands[Settings], settings, command, return_unknown_args=True)
+    config = baseline.config_for(settings, find_robot(command.robot))
+    together = make_dataclass(
+        "Together", [("settings", Annotated[Settings, arg(name="")]), ("baseline", baseline.Config)], frozen=True
+    )
+    found = _changed(AvoidSubcommands[together], together(settings, config), command, *more)
+    return found.settings, found.baseline
+
+
+def _changed(kind: Any, default: Any, command: Train, *more: str, **how: Any) -> Any:
+    """What ``default`` becomes with the options of the command line. Raises UserError in one line."""
+    method = "" if command.method == "ct" else f" --method {command.method}"
+
+    def parse() -> Any:
         return tyro.cli(
-            AvoidSubcommands[Settings],
-            prog=f"{PROGRAM} train {command.robot} --preset {command.preset}",
+            kind,
+            prog=f"{PROGRAM} train {command.robot} --preset {command.preset}{method}",
             description="All settings, with the values of the preset.",
-            default=settings,
+            default=default,
             args=[*command.changes, *more],
+            **how,
         )
 
-    return _in_one_line(parse, f"{PROGRAM} train --help and {PROGRAM} train {command.robot} {ALL_SETTINGS}")
+    return _in_one_line(parse, f"{PROGRAM} train --help and {PROGRAM} train {command.robot}{method} {ALL_SETTINGS}")
 
 
 def _print_settings(command: Any) -> None:
@@ -361,10 +397,9 @@ def _print_settings(command: Any) -> None:
     if not isinstance(command, Train):
         raise UserError(f"{ALL_SETTINGS} is for: {PROGRAM} train ROBOT {ALL_SETTINGS}")
     import ct_envs.quiet  # noqa: F401
-    from ct_jax.configs import get_preset
 
     with contextlib.suppress(SystemExit):
-        _changed(get_preset(command.preset, command.robot), command, "--help")
+        _settings_of(command, "--help")
 
 
 @contextlib.contextmanager
@@ -439,7 +474,6 @@ def _train(command: Train) -> None:
     prepare_jax(command.among)
     from ct_envs.physics import check_engine
     from ct_jax import pipeline
-    from ct_jax.configs import get_preset
     from ct_jax.model import load_controller
     from ct_jax.runtime.devices import is_first
     from ct_jax.runtime.run import Run, default_mazes, load_mazes
@@ -447,7 +481,7 @@ def _train(command: Train) -> None:
     seen, unseen = default_mazes(command.robot)
     check_engine(command.engine)
     pipeline.check_seed(command.seed)
-    settings = _changed(get_preset(command.preset, command.robot), command)
+    settings, baseline = _settings_of(command)
     if command.controller is not None:
         settings = replace(settings, controller=command.controller)
     if command.random_mazes is not None:
@@ -455,7 +489,7 @@ def _train(command: Train) -> None:
     if settings.controller != "own":
         load_controller(settings.controller, command.robot)  # check it before the run folder is made
     run = Run(
-        folder=command.out or Path("runs") / f"{command.robot}-{command.preset}-{command.seed}",
+        folder=command.out or Path("runs") / "-".join(_folder_words(command)),
         robot=command.robot,
         preset=command.preset,
         settings=settings,
@@ -463,11 +497,19 @@ def _train(command: Train) -> None:
         eval_mazes=load_mazes(command.eval_maze or unseen),
         seed=command.seed,
         engine=command.engine,
+        method=command.method,
+        baseline=baseline,
     )
     report = pipeline.train(run, resume=command.resume)
     if is_first():
         print_rows(pipeline.results(run.folder))
-        print(f"model:  {printable(run.folder / 'model')}\nreport: {printable(report)}")
+        print(f"model:  {printable(run.trained)}\nreport: {printable(report)}")
+
+
+def _folder_words(command: Train) -> list[str]:
+    """The parts of the default folder's name."""
+    method = [] if command.method == "ct" else [command.method]
+    return [command.robot, *method, command.preset, str(command.seed)]
 
 
 def _checked_count(mazes: int) -> int:

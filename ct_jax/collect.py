@@ -29,9 +29,8 @@ class CollectConfig(Checked):
 
     trajectories: Count = 1000  # T: successes to collect
     reset_interval: Count = 25  # L: episodes on one roadmap
-    guide: GuideName = (
-        "roadmap"  # planner: "roadmap" point by point, "shortcut" to visible points, "explorer" without map
-    )
+    # The planner: "roadmap" point by point, "shortcut" to visible points, "explorer" without map.
+    guide: GuideName = "roadmap"
     # Starts and goals: "vertices" of the roadmap (paper), or free points of the "maze".
     starts: Literal["vertices", "maze"] = "vertices"
     noise: Annotated[float, Within(0, 100)] = 0.0  # standard deviation of a disturbance of actions; it is not imitated

@@ -31,9 +31,9 @@ TESTS = 20  # number of tests of the controller on held-out edges during its tra
 class ControllerConfig(Checked):
     """All settings of a controller: of its learner, of what it learns, and of what it sees."""
 
-    sac: SacConfig = SacConfig()
-    edges: EdgeConfig = EdgeConfig()
-    augment: AugmentConfig = AugmentConfig()
+    sac: SacConfig = SacConfig()  # the learner
+    edges: EdgeConfig = EdgeConfig()  # the task
+    augment: AugmentConfig = AugmentConfig()  # frame and symmetries
 
     def scaled(self, factor: float) -> "ControllerConfig":
         """The same with actions smaller by this factor."""

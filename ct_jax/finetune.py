@@ -31,17 +31,17 @@ class RecoverConfig(Checked):
     """Recovery-based data collection (paper, Algorithm 4). The defaults are the paper's, if the paper gives them."""
 
     recoveries: Count = 500  # T
-    stuck_steps: Annotated[int, Within(1, 100_000)] = 40  # failure: within this many steps ...
-    stuck_m: Annotated[float, Within(0, 10_000)] = 4.0  # ... the robot moved less than this [m]
-    bumps: Annotated[int, Within(1, 100_000)] | None = None  # failure: the robot touched a wall in this many of the
-    # last ``stuck_steps``
+    stuck_steps: Annotated[int, Within(1, 100_000)] = 40  # failure: in this many steps, it moved less than ``stuck_m``
+    stuck_m: Annotated[float, Within(0, 10_000)] = 4.0  # see ``stuck_steps`` [m]
+    # Failure: the robot touched a wall in this many of the last ``stuck_steps``.
+    bumps: Annotated[int, Within(1, 100_000)] | None = None
     patience: Annotated[int, Within(1, 1_000_000)] = 200  # failure: the goal is not reached after this many steps
     takeover: Share = 0.0  # chance at each step that the planner takes over without a failure; paper: 0
-    keep: Literal["separate", "joined", "relabelled"] = "separate"  # failure and recovery as two trajectories (paper);
-    # "joined": one trajectory, in which only the recovery is imitated;
-    # "relabelled": one trajectory, and the planner's action is imitated at every step (DAgger)
-    random_mazes: Annotated[int, Within(0, 10_000)] = 0  # number of random mazes to fail and recover in, besides the
-    # run's mazes
+    # Failure and recovery as two trajectories (paper); "joined": one trajectory, in which only the recovery is
+    # imitated; "relabelled": one trajectory, and the planner's action is imitated at every step (DAgger).
+    keep: Literal["separate", "joined", "relabelled"] = "separate"
+    # Number of random mazes to fail and recover in, besides the run's mazes.
+    random_mazes: Annotated[int, Within(0, 10_000)] = 0
     give_up: Annotated[float, Above(0, 1_000_000)] = 20.0  # stop after this many times T episodes
 
 

@@ -38,32 +38,35 @@ MODE_SPREAD = 0.05
 class FitConfig(Checked):
     """One supervised training (paper, table I)."""
 
-    updates: Count = 75_000
+    updates: Count = 75_000  # gradient updates
     batch: Annotated[int, Within(1, 1_000_000)] = 64  # windows in a batch
-    steps: Annotated[int, Within(1, 100_000)] = 50  # steps in a window, ``ModelConfig.stride`` apart; with more than K,
-    # a window trains several predictions with a full past
-    learning_rate: Annotated[float, Above(0, 10)] = 4e-4
-    weight_decay: Annotated[float, Within(0, 100)] = 1e-3
+    # Steps in a window, ``ModelConfig.stride`` apart; with more than K, a window trains several predictions with a full
+    # past.
+    steps: Annotated[int, Within(1, 100_000)] = 50
+    learning_rate: Annotated[float, Above(0, 10)] = 4e-4  # after the warm-up
+    weight_decay: Annotated[float, Within(0, 100)] = 1e-3  # of AdamW
     warmup: Count = 10_000  # updates of linear warm-up
     decay: bool = False  # cosine decay to zero after the warm-up; the paper keeps the rate
     clip: Annotated[float, Above(0, 1_000_000)] = 1.0  # largest norm of a gradient
     mirror: bool = False  # turn and reflect each window by a random symmetry of the robot
-    turns: bool = False  # with ``mirror``: only rotate the world with the robot in it. The gait of a controller may not
-    # be symmetric; then a model that also learns the mirrored gait learns the mean of the two
+    # With ``mirror``: only rotate the world with the robot in it. The gait of a controller may not be symmetric; then a
+    # model that also learns the mirrored gait learns the mean of the two.
+    turns: bool = False
     shift_timestep: Annotated[int, Within(0, 1_000_000)] = 0  # add a random number up to this to a window's timesteps
-    precision: Literal["float32", "bfloat16"] = "float32"  # of the transformer's computations: "bfloat16" for
-    # accelerators; parameters stay float32
+    # Precision of the transformer's computations: "bfloat16" for accelerators. Parameters stay float32.
+    precision: Literal["float32", "bfloat16"] = "float32"
 
 
 @dataclass(frozen=True)
 class ValueConfig(Checked):
     """Training of the value network, and the selection of its trajectories (paper, sec. III-D)."""
 
+    # The training of the network.
     fit: FitConfig = FitConfig(updates=3000, batch=512, steps=1, learning_rate=1e-3, warmup=100, decay=True)
-    top: Annotated[float, Above(0, 1)] = 1.0  # use only this best share X of the trajectories, ranked by return divided
-    # by the squared straight distance
+    # Use only this best share X of the trajectories, ranked by return divided by the squared straight distance.
+    top: Annotated[float, Above(0, 1)] = 1.0
     collision_free: bool = False  # only trajectories without a collision
-    width: Annotated[int, Within(1, 16_384)] = 128
+    width: Annotated[int, Within(1, 16_384)] = 128  # of all layers
 
 
 Loss = Callable[[Any, Window, jax.Array], tuple[jax.Array, Info]]

@@ -47,8 +47,8 @@ class TrainedModel:
 
     robot: str
     settings: Settings
-    policy: TransformerPolicy
-    controller: SacController | DifferentialDrive  # learned, as the settings describe it, or known
+    policy: Any  # a ``TransformerPolicy``, or what a baseline learned
+    controller: SacController | DifferentialDrive | None  # learned, as the settings describe it, or known
     made: dict[str, Any] = field(default_factory=dict)  # command, commit, hardware, date
 
     def agent(self) -> Agent:
@@ -85,7 +85,12 @@ def model_folder(run: str) -> Path:
     for folder in (Path(run) / "model", Path(run)):
         if (folder / "model.json").is_file():
             return folder
-    if (Path(run) / "config.json").is_file():
+    config = Path(run) / "config.json"
+    if config.is_file():
+        said = read_json(config, hint="restore it")
+        if "baseline" in said:
+            method = shown(said.get("method"), quoted=False)
+            raise UserError(f"{run}: a run of {method}, without a transformer; evaluate it with --method {method}")
         raise UserError(f"{run}: not trained to the end yet; continue it with: ct-jax train ... --out {run} --resume")
     raise UserError(f"{run}: no run folder; give one that 'ct-jax train' wrote, or {_zoo_words()}")
 
@@ -251,7 +256,7 @@ def _blank_sac(robot: str, config: ControllerConfig) -> SacController:
     return jax.eval_shape(lambda key: blank_controller(key, *sizes(robot), config), jax.random.key(0))
 
 
-def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive) -> dict[str, Any]:
+def _arrays(policy: TransformerPolicy, controller: SacController | DifferentialDrive | None) -> dict[str, Any]:
     arrays = {"transformer": policy.params, "value": policy.value_params}
     if isinstance(controller, SacController):
         arrays |= {"normalizer": controller.normalizer, "controller": controller.policy}

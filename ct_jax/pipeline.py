@@ -1,4 +1,5 @@
-"""Algorithm 1, stage by stage: prm, controller, collect, fit, finetune, evaluate, report.
+"""Algorithm 1, stage by stage: prm, controller, collect, fit, finetune, evaluate, report. A baseline has its own stage
+in place of fit and finetune.
 
 Each stage writes into its own folder of the run; a finished stage is read back instead of run again, and what an
 interrupted one has finished is kept.
@@ -15,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ct_envs import UserError
+from ct_envs.checked import Checked, from_json
 from ct_envs.robots import Robot, get_robot
 from ct_jax import trajectories as storage
+from ct_jax.baselines import TRANSFORMERS, baseline_of, check_method, get_baseline
 from ct_jax.collect import collect, kept_in
 from ct_jax.controller import ControllerConfig
-from ct_jax.evaluate import METHODS, Episodes, evaluate
+from ct_jax.evaluate import GUIDED, Episodes, evaluate
 from ct_jax.finetune import recover
 from ct_jax.fit import Fit, FitConfig, best_trajectories, fit, init_params, transformer_loss, value_loss
 from ct_jax.heads import with_skill
@@ -29,13 +32,26 @@ from ct_jax.runtime import devices
 from ct_jax.runtime.checkpoint import load_weights, read_json, save_weights, write_json
 from ct_jax.runtime.numerics import with_own_numerics
 from ct_jax.runtime.progress import Bar, Metrics
-from ct_jax.runtime.run import Run, drop_leftovers, is_row, kept_row, open_run, training
+from ct_jax.runtime.run import (
+    BASELINES,
+    Run,
+    as_json,
+    claim,
+    drop_leftovers,
+    is_row,
+    kept_row,
+    open_run,
+    stored_run,
+    training,
+)
 from ct_jax.settings import MAX_RETURN_SCALE, MAX_SEED, with_controller
 from ct_jax.trajectories import Trajectories
 from ct_jax.transformer import ControlTransformer
 from ct_jax.types import Controller, Policy, World
 from ct_jax.value import ValueNetwork
 from ct_jax.worlds import Request, Trial, kind_of
+
+_WEIGHTS = "weights.safetensors"
 
 
 @with_own_numerics
@@ -47,16 +63,34 @@ def train(run: Run, *, resume: bool = False) -> Path:
         KeyboardInterrupt: Ctrl-C; ``resume`` goes on from there.
     """
     _check_processes(run.spec)
+    _check_method(run)
     from ct_jax.report import write_report  # imports matplotlib, which is slow
 
     with open_run(run, resume=resume):
         metrics = Metrics(run.folder)
         try:
-            model = _model(run, metrics)
-            _evaluate(run, model)
+            if run.baseline is None:
+                model = _model(run, metrics)
+                policy, controller = model.policy, model.controller
+            else:
+                policy, controller = learned_baseline(run, run.baseline, metrics)
+            _evaluate(run, policy, controller)
         finally:
             metrics.close()
         return Path(devices.first(lambda: str(write_report(run.folder))))
+
+
+def _check_method(run: Run) -> None:
+    """Raise UserError if the run's method is unknown, or is not for its robot or its settings."""
+    check_method(run.method)
+    if run.method not in TRANSFORMERS:
+        if jax.process_count() > 1:
+            raise UserError(f"--method {run.method} trains in one process; start only one")
+        assert run.baseline is not None
+        get_baseline(run.method).blank(run, run.baseline)
+    for name, value in TRANSFORMERS.get(run.method, {}).items():
+        if getattr(run.settings.model, name) != value:
+            raise UserError(f"--method {run.method} has model.{name}={value}; leave out --model.{name}")
 
 
 def _model(run: Run, metrics: Metrics) -> TrainedModel:
@@ -183,6 +217,55 @@ def _fit_network(
     return params
 
 
+# ------------------------------------------------------------------------------------------------------- baselines
+
+
+def learned_baseline(run: Run, config: Checked, metrics: Metrics, name: str = "") -> tuple[Policy, Controller | None]:
+    """What a baseline learned in a run, learned now or read back; and the controller of its data, if it needs any.
+
+    Args:
+        config: a ``Config`` of the baseline.
+        name: of the folder in ``baselines`` (default: the baseline's name).
+
+    Raises:
+        UserError: the settings are not for the robot, or the folder was made with other settings.
+    """
+    baseline = baseline_of(config)
+    name = name or baseline.NAME
+    stage = f"{BASELINES}/{name}"
+    folder, controller, data = run.folder / stage, None, None
+    policy = baseline.blank(run, config)
+    if baseline.TRAJECTORIES:
+        controller, _ = kind_of(run.spec).controller(run, metrics)
+        data = planning_trajectories(run, controller)
+    claim(folder / "baseline.json", as_json(config), "settings")
+    if run.done(stage) is None:
+        total = config.total  # pyright: ignore[reportAttributeAccessIssue]
+        with run.stage(stage):
+            with training(folder, name, total, metrics) as watch:
+                learned = baseline.learn(jax.random.fold_in(run.key("fit"), total), run, config, data, **watch)
+            devices.first(lambda: save_weights(folder / _WEIGHTS, learned.params))  # pyright: ignore[reportAttributeAccessIssue]
+    return _with_weights(run, policy, stage), controller
+
+
+def _with_weights(run: Run, policy: Any, stage: str) -> Any:
+    """A blank policy with the weights that a stage learned."""
+    params = load_weights(run.folder / stage / _WEIGHTS, policy.params, hint=run.hint(stage))
+    return replace(policy, params=jax.tree.map(jnp.asarray, params))
+
+
+def _load_baseline(folder: Path, method: str) -> TrainedModel:
+    """What a baseline learned in a run folder, as ``learned_baseline`` left it. Raises UserError."""
+    baseline, stage = get_baseline(method), f"{BASELINES}/{method}"
+    run = stored_run(folder)
+    if run.done(stage) is None:
+        raise UserError(f"{folder}: has no trained {method}; train it with: ct-jax train {run.robot} --method {method}")
+    file = folder / stage / "baseline.json"
+    config = from_json(baseline.Config, read_json(file, hint=run.hint(stage)).get("of"), f"{file}: of")
+    policy = _with_weights(run, baseline.blank(run, config), stage)
+    return TrainedModel(run.robot, run.settings, policy, None, run.made)
+
+
 # ----------------------------------------------------------------------------------------------------- fine-tuning
 
 
@@ -217,15 +300,15 @@ def _recoveries(run: Run, world: World, number: int, policy: TransformerPolicy, 
 # ------------------------------------------------------------------------------------------------------ evaluation
 
 
-def _evaluate(run: Run, model: TrainedModel) -> None:
-    """Every method everywhere; each row is kept as soon as it is there."""
+def _evaluate(run: Run, policy: Policy, controller: Controller | None) -> None:
+    """The run's method everywhere, and with a controller the planners; each row is kept as soon as it is there."""
     if run.done("evaluate") is not None:
         return
     with run.stage("evaluate") as (folder, _):
         rows = [
-            evaluated(run, folder, trial, method, policy=model.policy, controller=model.controller)
+            evaluated(run, folder, trial, method, policy=policy, controller=controller)
             for trial in kind_of(run.spec).trials(run, folder)
-            for method in METHODS
+            for method in (run.method, *(GUIDED if controller is not None else ()))
         ]
         write_json(folder / "results.json", {"rows": rows})
 
@@ -274,9 +357,8 @@ def evaluate_model(
         UserError: unknown model, method or maze, an option that is not for this robot, or one out of its range.
     """
     check_seed(seed)
-    if method not in METHODS:
-        raise UserError(f"no method named '{method}'; methods: {', '.join(METHODS)}")
-    model = load_model(run)
+    check_method(method, *GUIDED)
+    model = _load(run, method)
     robot = get_robot(model.robot)
     _check_processes(robot)
     kind = kind_of(robot)
@@ -288,6 +370,28 @@ def evaluate_model(
     if return_scale is not None:
         model, asked = _asking(model, method, return_scale), {"return_scale": return_scale}
     return answer(kind.Request(**options), model, method, seed, lambda row: keep(row | asked)) | asked
+
+
+def _load(where: str, method: str) -> TrainedModel:
+    """What an evaluation of a method needs of a run folder or model. Raises UserError if it is not there."""
+    folder = Path(where)
+    if method not in (*TRANSFORMERS, *GUIDED):
+        return _load_baseline(folder, method)
+    run = None
+    if not (folder / "model" / "model.json").is_file() and (folder / "config.json").is_file():
+        run = stored_run(folder)
+    if run is None or run.baseline is None or method in TRANSFORMERS:
+        model = load_model(where)
+        for name, value in TRANSFORMERS.get(method, {}).items():
+            if getattr(model.settings.model, name) != value:
+                raise UserError(f"{where}: its transformer has not model.{name}={value}; give --method ct")
+        return model
+    if not get_baseline(run.method).TRAJECTORIES:
+        raise UserError(f"{where}: {run.method} has no low-level controller; give --method {run.method}")
+    if kind_of(run.spec).KNOWN_CONTROLLER is None and run.done("controller") is None:
+        raise UserError(f"{where}: has no trained controller yet; continue it with --resume")
+    controller, config = kind_of(run.spec).controller(run, None)
+    return TrainedModel(run.robot, with_controller(run.settings, config), None, controller, run.made)
 
 
 def answer(

@@ -39,8 +39,8 @@ class PrmConfig(Checked):
     samples: Annotated[int, Within(2, 20_000)] = 200  # n; doubled until the roadmap joins starts and goals
     connect_m: Annotated[float, Above(0, 10_000)] = 10.0  # d: longest edge [m]
     margin_m: Annotated[float, Within(0, 100)] = 0.0  # clearance beyond the robot's radius [m]; the paper has none
-    most_samples: Annotated[int, Within(2, 30_000)] = 25_600  # sampling stops at this number, even if the roadmap does
-    # not join everything; a point's index has 16 bits
+    # Sampling stops at this number, even if the roadmap does not join everything; a point's index has 16 bits.
+    most_samples: Annotated[int, Within(2, 30_000)] = 25_600
 
 
 @struct.dataclass

@@ -29,12 +29,12 @@ MAX_EPISODES, MAX_RANDOM_MAZES = 100_000, 10_000
 class RoomConfig(Checked):
     """The rooms of training and evaluation."""
 
-    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0  # density of obstacles in training; the published numbers
-    # are measured at 1
-    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None  # if given, each room's density is drawn between
-    # ``density`` and this
-    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0  # level of sensor and motion noise in training; 1 is that of a
-    # real robot
+    # Density of obstacles in training; the published numbers are measured at 1.
+    density: Annotated[float, Within(0, MAX_FACTOR)] = 1.0
+    # If given, each room's density is drawn between ``density`` and this.
+    densest: Annotated[float, Within(0, MAX_FACTOR)] | None = None
+    # Level of sensor and motion noise in training; 1 is that of a real robot.
+    noise: Annotated[float, Within(0, MAX_NOISE)] = 0.0
     worlds: Annotated[int, Within(1, MAX_WORLDS)] = 20  # number of evaluation rooms (paper)
 
     @property
@@ -47,28 +47,29 @@ class RoomConfig(Checked):
 class Settings(Checked):
     """Everything a run depends on besides its robot, mazes, engine and seed."""
 
-    prm: PrmConfig = PrmConfig()
+    prm: PrmConfig = PrmConfig()  # roadmaps
     controller: str = "own"  # learn one's "own", take the one of the "zoo", or that of a folder
+    # The controller's learner (Soft Actor-Critic). Values marked "paper" are from sec. III-G.
     sac: SacConfig = SacConfig()
-    edges: EdgeConfig = EdgeConfig()
-    augment: AugmentConfig = AugmentConfig()
-    controller_action_scale: Annotated[float, Above(0, 1)] = 1.0  # of a learned controller's actions, when it leads:
-    # with less it falls less
-    collect: CollectConfig = CollectConfig()
-    model: ModelConfig = ModelConfig()
-    value: ValueConfig = ValueConfig()
-    fit: FitConfig = FitConfig()
-    recover: RecoverConfig = RecoverConfig()
+    edges: EdgeConfig = EdgeConfig()  # the controller's task: walks along edges
+    augment: AugmentConfig = AugmentConfig()  # the controller's frame and symmetries
+    # Factor of a learned controller's actions when it follows a planner: with less, the robot falls less.
+    controller_action_scale: Annotated[float, Above(0, 1)] = 1.0
+    collect: CollectConfig = CollectConfig()  # planner-guided collection (paper, Algorithm 3)
+    model: ModelConfig = ModelConfig()  # the transformer (paper, table I)
+    value: ValueConfig = ValueConfig()  # the value network and its training (paper, sec. III-D)
+    fit: FitConfig = FitConfig()  # the first training of the transformer (paper, table I)
+    recover: RecoverConfig = RecoverConfig()  # collection of recoveries (paper, Algorithm 4)
     rounds: Annotated[int, Within(0, 1000)] = 0  # I: iterations of fine-tuning on recoveries (paper, Algorithm 1)
     round_fit: FitConfig | None = None  # the training in each round but the last; by default as ``fit``
     last_fit: FitConfig | None = None  # the training in the last round; by default as ``round_fit``
     return_scale: Annotated[float, Above(0, MAX_RETURN_SCALE)] = 1.0  # k: ask for k * V (paper, sec. III-D)
     clip_target_return: bool = False  # never ask for more than V of the present state
-    random_mazes: Annotated[int, Within(0, MAX_RANDOM_MAZES)] = 0  # number of random mazes to collect and recover in,
-    # besides the named ones
+    # Number of random mazes to collect and recover in, besides the named ones.
+    random_mazes: Annotated[int, Within(0, MAX_RANDOM_MAZES)] = 0
     episodes: Annotated[int, Within(1, MAX_EPISODES)] = 100  # start-goal pairs of the evaluation in each maze (paper)
-    pairs_seed: Annotated[int, Within(0, MAX_SEED)] = 0  # their seed: not the run's, so that all models meet the same
-    # pairs
+    # Seed of the start-goal pairs: not the run's, so that all models have the same pairs.
+    pairs_seed: Annotated[int, Within(0, MAX_SEED)] = 0
     rooms: RoomConfig | None = None  # of a robot that drives in rooms; for such a one, ``episodes`` are in each room
 
 

@@ -37,25 +37,23 @@ SPEED_SCALE = 5.0  # velocities of a body [m/s, rad/s] are divided by this
 class ModelConfig(Checked):
     """Sizes of the transformer (paper, table I)."""
 
-    layers: Annotated[int, Within(1, 64)] = 4
-    heads: Annotated[int, Within(1, 64)] = 4
+    layers: Annotated[int, Within(1, 64)] = 4  # transformer blocks
+    heads: Annotated[int, Within(1, 64)] = 4  # attention heads; the width is a multiple of them
     width: Annotated[int, Within(1, 16_384)] = 128  # embedding dimension
     context: Annotated[int, Within(1, 10_000)] = 50  # K [steps] in training
     context_acting: Annotated[int, Within(1, 10_000)] = 50  # K [steps] when acting
-    dropout: Annotated[float, Within(0, 0.99)] = 0.1
+    dropout: Annotated[float, Within(0, 0.99)] = 0.1  # share of activations that training drops
     max_timestep: Annotated[int, Within(1, 1_000_000)] = 1024  # embeddings of the absolute timestep
     map_cell_m: Annotated[float, Above(0, 100)] = 0.8  # side of a cell of the local map [m]
     returns: bool = True  # condition on returns; without them this is BC-CT
     actions: bool = True  # see its own past actions, as the paper's does; without them, it cannot repeat itself
     frame: FrameName = "world"  # the paper's; with "heading" the body is felt, and moved, in the robot's own frame
-    directions: Annotated[int, Within(1, 1024)] = 16  # with "heading": planar vectors that the trunk hands to the body,
-    # in the world's frame
-    modes: Annotated[int, Within(1, 256)] = 1  # actions to choose from (paper: 1); with one, left or right round an
-    # obstacle become straight at it
-    commitment: Annotated[float, Within(0, 1_000_000)] = (
-        0.0  # when acting, keep to the mode chosen before unless another is
-    )
-    # e^commitment times likelier
+    # With "heading": planar vectors that the trunk hands to the body, in the world's frame.
+    directions: Annotated[int, Within(1, 1024)] = 16
+    # Actions to choose from (paper: 1); with one, left or right round an obstacle become straight at it.
+    modes: Annotated[int, Within(1, 256)] = 1
+    # When acting, keep to the mode chosen before unless another is e^commitment times likelier.
+    commitment: Annotated[float, Within(0, 1_000_000)] = 0.0
     skill: bool = False  # the head is the low-level controller, which stays as it is: the trunk tells it where to go
     acting: Literal["cache", "window"] = "cache"  # keep keys and values, or compute the last K steps anew (paper)
     stride: Annotated[int, Within(1, 1000)] = 1  # control steps from one step of the memory to the next (paper: 1)

@@ -18,7 +18,7 @@ SKILL = {"model.skill": True, "fit.turns": True, "round_fit.turns": True, "last_
 
 SHIPPED = "calm-ct"  # the variant of zoo:ant
 
-VARIANTS = maze_variants("ant", frame="heading", bumps=40, memory=MEMORY, skill=SKILL)
+VARIANTS = maze_variants("ant", bumps=40, memory=MEMORY, skill=SKILL)
 
 if __name__ == "__main__":
     main("ant", VARIANTS, __doc__)

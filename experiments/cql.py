@@ -3,8 +3,8 @@
     python experiments/cql.py --robot ant [--alpha 0.05 0.2 1 5] [--target-rate 0.005 0.05] [--controller zoo]
 
 Each choice is trained on the planning trajectories of the method as published, and evaluated in the training
-maze on 100 pairs of seed 7 (the tables use seed 0). Writes ``experiments/results/cql.json``. ``study.pt_cql_config``
-contains the settings that were chosen.
+maze on 100 pairs of seed 7 (the tables use seed 0). Writes ``experiments/results/cql.json``. ``config_for``
+in ``ct_jax/baselines/cql.py`` gives the settings that were chosen.
 """
 
 import itertools
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import tyro
 from rows import RESULTS, CqlRow, replace_rows
-from study import Study, load_variants, pt_cql
+from study import Study, baseline_rows, load_variants
 
 from ct_envs import UserError
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
@@ -66,7 +66,7 @@ def main(options: Options) -> None:
         config = replace(variant.baseline, updates=options.updates, **tried)
         tried["updates"] = options.updates
         name = "-".join(f"{name}={value:g}" for name, value in tried.items())
-        keep([CqlRow.read(tried | {"model_seed": run.seed} | row) for row in pt_cql(run, config, name)])
+        keep([CqlRow.read(tried | {"model_seed": run.seed} | row) for row in baseline_rows(run, config, name)])
 
 
 def keep(rows: list[CqlRow]) -> None:

@@ -17,7 +17,7 @@ MEMORY = {"model.stride": 4}  # the memory holds every fourth step
 
 SHIPPED = "cpu"  # the variant of zoo:humanoid
 
-VARIANTS = maze_variants("humanoid", frame="heading", bumps=60, memory=MEMORY)
+VARIANTS = maze_variants("humanoid", bumps=60, memory=MEMORY)
 
 if __name__ == "__main__":
     main("humanoid", VARIANTS, __doc__)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from study import Variant, half_the_updates, pt_cql_config, sac_alone_config
+from study import Variant, baseline_config, half_the_updates
 
 BC = {"model.returns": False}
 # No fine-tuning. One training with all updates, and randomly shifted timesteps.
@@ -24,12 +24,11 @@ MAZES_CT = MAZES | {"rounds": 0, "fit.updates": 4000, "fit.decay": True}
 
 
 def maze_variants(
-    robot: str, *, frame: str, bumps: int, memory: Mapping[str, Any], skill: Mapping[str, Any] | None = None
+    robot: str, *, bumps: int, memory: Mapping[str, Any], skill: Mapping[str, Any] | None = None
 ) -> dict[str, Variant]:
     """The variants of a robot in mazes, by name.
 
     Args:
-        frame: of the baseline PT-CQL.
         bumps: steps with a collision that count as a failure, as published.
         memory: overrides for a memory of longer duration.
         skill: overrides for the low-level controller as the action head; without them, no variant has it.
@@ -39,8 +38,8 @@ def maze_variants(
         "published": Variant("published", label="CT"),
         "bc": Variant("published", BC, label="BC-CT"),
         "f-ct": Variant("published", f_ct, label="F-CT", tuned_from="published"),
-        "pt-cql": Variant("published", label="PT-CQL", baseline=pt_cql_config(frame)),
-        "sac": Variant("published", label="SAC alone", baseline=sac_alone_config(robot)),
+        "pt-cql": Variant("published", label="PT-CQL", baseline=baseline_config("pt-cql", robot)),
+        "sac": Variant("published", label="SAC alone", baseline=baseline_config("sac", robot)),
     }
     lifted = {"cpu": {}, "mazes": MAZES, "modes": MODES, "calm": CALM, "memory": memory}
     lifted |= {} if skill is None else {"skill": skill}

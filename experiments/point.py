@@ -16,7 +16,7 @@ SKILL = {"model.skill": True}  # the action head is the fixed low-level controll
 
 SHIPPED = "mazes-ct"  # the variant of zoo:point
 
-VARIANTS = maze_variants("point", frame="world", bumps=20, memory=MEMORY, skill=SKILL)
+VARIANTS = maze_variants("point", bumps=20, memory=MEMORY, skill=SKILL)
 
 if __name__ == "__main__":
     main("point", VARIANTS, __doc__)

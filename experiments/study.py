@@ -11,47 +11,42 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from rows import CT, RESULTS, Results, Row, Unmade, add_results, origin_of
 
 from ct_envs import UserError
+from ct_envs.checked import Checked
+from ct_envs.robots import get_robot
 from ct_jax import pipeline
-from ct_jax import trajectories as storage
-from ct_jax.baselines.cql import Cql, CqlConfig, train_cql
-from ct_jax.baselines.networks import Actor, ActorPolicy, sample_seen
-from ct_jax.baselines.sac_alone import SacAloneConfig, train_sac_alone
+from ct_jax.baselines import baseline_of, get_baseline
 from ct_jax.cli import guarded, leave, prepare_jax, print_rows
 from ct_jax.configs import get_preset
 from ct_jax.evaluate import GUIDED
 from ct_jax.finetune import NoRecoveryError
 from ct_jax.model import PARTS, load_controller
-from ct_jax.runtime.checkpoint import load_weights, read_json, save_weights, write_json
+from ct_jax.runtime.checkpoint import read_json, write_json
 from ct_jax.runtime.files import prepare_outputs
 from ct_jax.runtime.progress import Metrics
 from ct_jax.runtime.run import (
     Run,
+    as_json,
     default_mazes,
     episodes_file,
     identity,
     load_mazes,
     open_run,
     provenance,
-    training,
 )
 from ct_jax.runtime.terminal import printable
 from ct_jax.settings import Settings, to_dict
 from ct_jax.worlds import kind_of
-from ct_jax.worlds.maze_runs import make_env
-
-SAC_ALONE_ITERATIONS = 8000  # 500 episodes of the point
-
 
 # -------------------------------------------------------------------------------------------------------- variants
 
@@ -68,7 +63,7 @@ class Variant:
     """Name in tables (default: CT or F-CT with the variant's name)."""
     tuned_from: str | None = None
     """For a fine-tuned variant: the variant before fine-tuning."""
-    baseline: CqlConfig | SacAloneConfig | None = None
+    baseline: Checked | None = None
     """Baseline to train instead of a transformer: CQL on the run's data, or SAC without data."""
     sweeps: tuple[str, ...] = ()
     """Turtlebot3: further evaluations: "density", "noise", "seven"."""
@@ -94,16 +89,9 @@ def half_the_updates(published: Settings) -> Any:
     return replace(published.fit, updates=published.fit.updates // 2, warmup=20)
 
 
-def pt_cql_config(frame: str = "world") -> CqlConfig:
-    """PT-CQL's settings, chosen by ``experiments/cql.py``."""
-    return CqlConfig(updates=2500, mirror=True, frame=frame)
-
-
-def sac_alone_config(robot: str) -> SacAloneConfig:
-    """Settings of SAC alone: the controller's learner in the whole maze. Longer paths need a larger discount factor."""
-    settings = get_preset("cpu", robot)
-    sac = replace(settings.sac, discount=0.99, iterations=SAC_ALONE_ITERATIONS, reward_scale=0.1)
-    return SacAloneConfig(sac, replace(settings.edges.reward, alive_bonus=0.0), settings.augment.frame)
+def baseline_config(name: str, robot: str) -> Any:
+    """The settings of a baseline for the preset "cpu"."""
+    return get_baseline(name).config_for(get_preset("cpu", robot), get_robot(robot))
 
 
 def load_variants(robot: str) -> dict[str, Variant]:
@@ -258,7 +246,7 @@ class Study:
 def measure(run: Run, name: str, variant: Variant) -> list[Row]:
     """The rows of a run. The run is trained first unless it is finished."""
     if variant.baseline is not None:
-        found = BASELINES[type(variant.baseline)](run, variant.baseline)
+        found = baseline_rows(run, variant.baseline)
     else:
         pipeline.train(run, resume=True)
         found = [row | outcomes(run.folder / "evaluate", row) for row in pipeline.results(run.folder)]
@@ -367,9 +355,9 @@ def digest_words(*values: Any) -> str:
     return hashlib.sha256(words.encode()).hexdigest()[:12]
 
 
-def digest(settings: Settings, baseline: CqlConfig | SacAloneConfig | None = None) -> str:
+def digest(settings: Settings, baseline: Checked | None = None) -> str:
     """A digest of settings, and of those of a baseline."""
-    return digest_words(to_dict(settings), *([asdict(baseline)] if baseline else []))
+    return digest_words(to_dict(settings), *([as_json(baseline)] if baseline else []))
 
 
 def outcomes(folder: Path, row: dict[str, Any]) -> dict[str, dict[str, str]]:
@@ -392,78 +380,22 @@ def keep_once(file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, An
     return read_json(file)
 
 
-def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
-    """Record the inputs of the results in a file's folder; returns the origin of the first record.
-
-    Args:
-        what: the name of the inputs in the error.
-
-    Raises:
-        UserError: the results in the folder have other inputs.
-    """
-    inputs = json.loads(json.dumps(inputs, default=str))  # tuples become lists, as when the file is read
-    if not file.is_file():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, {"of": inputs} | origin_of(provenance()))
-    before = read_json(file)
-    if before.get("of") != inputs:
-        raise UserError(f"{file.parent}: was made with other {what}; delete it to make it again")
-    return origin_of(before)
-
-
 # ------------------------------------------------------------------------------------------------------- baselines
 
 
-def pt_cql(run: Run, config: CqlConfig, name: str = "pt-cql") -> list[dict[str, Any]]:
-    """Rows of PT-CQL. It is trained on the run's planning trajectories, which are collected first if needed."""
-    with open_run(run, resume=True):
-        metrics = Metrics(run.folder)
-        controller, _ = kind_of(run.spec).controller(run, metrics)
-        metrics.close()
-        pipeline.planning_trajectories(run, controller)
+def baseline_rows(run: Run, config: Checked, name: str = "") -> list[dict[str, Any]]:
+    """Rows of one baseline. It is trained first unless it is finished.
 
-    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
-        data = storage.load(run.folder / "collect" / "trajectories.npz")
-        learner = Cql(config, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
-        return train_cql(key, learner, data, run.stacked, **watch)
-
-    return baseline(run, name, learn, config, config.updates, config.width)
-
-
-def sac_alone(run: Run, config: SacAloneConfig) -> list[dict[str, Any]]:
-    """Rows of SAC alone, trained in the run's maze without the run's data."""
-
-    def learn(key: jax.Array, **watch: Any) -> ActorPolicy:
-        return train_sac_alone(key, functools.partial(make_env, run), next(iter(run.mazes.values())), config, **watch)
-
-    return baseline(run, "sac", learn, config, config.sac.iterations, config.sac.hidden[0])
-
-
-BASELINES: dict[type, Callable[[Run, Any], list[dict[str, Any]]]] = {CqlConfig: pt_cql, SacAloneConfig: sac_alone}
-
-
-def baseline(
-    run: Run, name: str, learn: Callable, config: CqlConfig | SacAloneConfig, total: int, width: int
-) -> list[dict[str, Any]]:
-    """Rows of one baseline. It is trained first unless it is finished."""
-    frame, stage = config.frame, f"baselines/{name}"
-    folder = run.folder / stage
-    env = make_env(run, auto_reset=False)
-    actor = Actor(env.action_size, width, frame)
-    params = actor.init(jax.random.key(0), sample_seen(env.proprio_size))
-    policy = ActorPolicy(params, env.action_size, width, frame)
-    file = folder / "weights.safetensors"
+    Args:
+        name: of its folder in the run, and of its rows (default: the baseline's name).
+    """
+    name = name or baseline_of(config).NAME
+    folder = run.folder / "baselines" / name
     with open_run(run, resume=True):
         (run.folder / "evaluate").mkdir(exist_ok=True)  # for the pairs
-        made = claim(folder / "baseline.json", asdict(config), "settings")
-        if run.done(stage) is None:
-            with run.stage(stage):
-                metrics = Metrics(folder)
-                with training(folder, name, total, metrics) as watch:
-                    learned = learn(jax.random.fold_in(run.key("fit"), total), **watch)
-                metrics.close()
-                save_weights(file, learned.params)
-        policy = policy.replace(params=jax.tree.map(jnp.asarray, load_weights(file, params)))
+        with closing(Metrics(run.folder)) as metrics:
+            policy, _ = pipeline.learned_baseline(run, config, metrics, name)
+        made = origin_of(read_json(folder / "baseline.json"))
         trials = kind_of(run.spec).trials(run, run.folder / "evaluate")
         rows = [pipeline.evaluated(run, folder, trial, name, policy=policy) for trial in trials]
     return [made | {"settings": digest(run.settings, config)} | row | outcomes(folder, row) for row in rows]

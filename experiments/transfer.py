@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import tyro
 from rows import CT, RESULTS, TransferRow, origin_of, replace_rows
-from study import claim, digest_arrays
+from study import digest_arrays
 
 from ct_envs import Maze, MazeEnv, UserError, stack_mazes
 from ct_envs.maze import make_maze, parse_walls
@@ -29,7 +29,7 @@ from ct_jax.model import TrainedModel, load_model
 from ct_jax.runtime.checkpoint import Checkpoints, read_json, write_json
 from ct_jax.runtime.files import prepare_outputs
 from ct_jax.runtime.progress import Bar
-from ct_jax.runtime.run import provenance, random_mazes
+from ct_jax.runtime.run import claim, provenance, random_mazes
 from ct_jax.trajectories import Trajectories
 from ct_jax.transfer import transfer
 from ct_jax.worlds.mazes import MazeWorld

@@ -40,7 +40,7 @@ TOPICS = {
     "value": {"III-D", "III-F"},
     "fit": {"III-D"},
     "policy": {"III-D"},
-    "settings": {"III-D"},
+    "settings": {"III-D", "III-G"},
     "baselines": {"IV-A"},
     "cql": {"IV-A"},
     "sac_alone": {"IV-A"},

@@ -227,7 +227,10 @@ print("heavy:", status, [name for name in {heavy!r} if name in sys.modules])"""
         (["train", "point", "--maze", "atlantis"], ["'atlantis'", "antmaze-large", "hall"]),
         (["train", "point", "--eval-maze", "atlantis"], ["'atlantis'", "antmaze-large", "hall"]),
         (["evaluate", "RUN", "--maze", "atlantis"], ["'atlantis'", "antmaze-large"]),
-        (["evaluate", "RUN", "--method", "luck"], ["no method named 'luck'", "ct, planner, explorer"]),
+        (
+            ["evaluate", "RUN", "--method", "luck"],
+            ["no method named 'luck'", "ct, bc-ct, pt-cql, sac, planner, explorer"],
+        ),
         (["evaluate", "RUN", "--engine", "warp"], ["no engine named 'warp'", "auto, mjx, mujoco"]),
         (["evaluate", "RUN", "--episodes", "0"], ["--episodes 0", "from 1"]),
         (["evaluate", "RUN", "--episodes", "-5"], ["--episodes -5", "from 1"]),

@@ -19,7 +19,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 import study
 from rows import RESULTS
 
-from ct_jax.cli import COMMANDS
+from ct_envs import UserError
+from ct_jax.cli import COMMANDS, main
 from ct_jax.settings import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -134,10 +135,29 @@ def parse(options: type, arguments: list[str]) -> object:
         pytest.fail(said.getvalue())
 
 
-@pytest.mark.parametrize("command", commands("ct-jax "))
+OURS = commands("ct-jax ")
+TRAININGS = [command for command in OURS if command.startswith("ct-jax train ") and "--help" not in command.split()]
+
+
+@pytest.mark.parametrize("command", sorted({*OURS} - {*TRAININGS}))
 def test_ct_jax_commands_parse(command):
     _, name, *arguments = shlex.split(command)
     parse(COMMANDS[name], arguments)
+
+
+@pytest.mark.parametrize("command", TRAININGS)
+def test_trainings_parse_with_their_settings(command, monkeypatch, capsys):
+    def train(run, *, resume):
+        raise UserError("all options are known")
+
+    monkeypatch.setattr("ct_jax.cli.prepare_jax", lambda among: None)
+    monkeypatch.setattr("ct_jax.pipeline.train", train)
+    monkeypatch.setattr("ct_jax.runtime.run.load_mazes", lambda names: {})
+    monkeypatch.setattr("ct_jax.model.load_controller", lambda where, robot: None)
+    monkeypatch.setattr("ct_envs.turtlebot3.load_pybullet", lambda: None)
+    status, said = main(shlex.split(command)[1:]), capsys.readouterr()
+    shown = status == 0 and "--help-all" in command and "usage:" in said.out
+    assert shown or "all options are known" in said.err or "no robot named 'heavy'" in said.err  # an example's robot
 
 
 def test_experiment_commands_parse():

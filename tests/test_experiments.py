@@ -198,7 +198,7 @@ def test_rows_are_measured_once_and_kept(tiny, tiny_run, tiny_settings, tiny_stu
     assert all(row.episodes == 4 and row.seed == 0 for row in rows)
     assert all(0 < (row.learn_wall_s or 0) <= row.run_wall_s for row in rows if row.method in ("pt-cql", "sac"))
     assert all(set(row.more) >= {"success_ci95", "return_mean"} for row in rows)  # and all other measurements
-    monkeypatch.setattr(study, "train_cql", None)
+    monkeypatch.setattr("ct_jax.baselines.cql.train_cql", None)
     assert tiny_study.run(variants, (0,), ignore).rows == rows
     variants["pt-cql"] = Variant("tiny", baseline=replace(cql, updates=3))
     with pytest.raises(UserError, match="other settings; delete it"):

@@ -381,6 +381,7 @@ def test_invalid_wall_time_is_error(tmp_path, tiny_settings):
         ({"mazes": load_mazes(("antmaze-medium",))}, "mazes antmaze-umaze, not antmaze-medium"),
         ({"mazes": {"antmaze-umaze": load_maze("antmaze-medium")}}, "another mazes.antmaze-umaze"),
         ({"eval_mazes": load_mazes(("antmaze-medium",))}, "eval_mazes"),
+        ({"method": "bc-ct"}, "method ct, not bc-ct"),
     ],
 )
 def test_run_resumes_only_with_same_configuration(changes, words, tmp_path, tiny_settings):
@@ -445,7 +446,7 @@ def test_all_stages_run_without_jit(jit_disabled, tmp_path, tiny_settings, monke
 
     # What would take minutes op by op, and is tested elsewhere: planner and explorer, a roadmap of a thousand points,
     # and first parameters.
-    monkeypatch.setattr(pipeline, "METHODS", ("ct",))
+    monkeypatch.setattr(pipeline, "GUIDED", ())
     for module, name in ((MazeWorld, "draw_pairs"), (pipeline, "init_params")):
         monkeypatch.setattr(module, name, jax.disable_jit(False)(getattr(module, name)))
     run = make_run(tmp_path / "run", settings, mazes=load_mazes((str(islands),)))

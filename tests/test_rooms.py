@@ -285,3 +285,16 @@ def test_the_seven_pairs_are_each_run_several_times():
         assert len(np.unique(trial.pairs.start, axis=0)) == 7
         episodes = pipeline.measured(trial, "planner", policy=None, controller=DifferentialDrive())  # pyright: ignore
         assert sum(grades(episodes).values()) == 14 and episodes.success.all()
+
+
+def test_pt_cql_is_trained_and_evaluated_in_rooms(tmp_path, monkeypatch, capsys):
+    """It learns from the trajectories, which keep their local maps. The planner comes with the known controller."""
+    monkeypatch.setitem(turtlebot3.PRESETS, "tiny", TINY)
+    monkeypatch.setattr(cli, "prepare_jax", lambda *_: None)
+    folder, small = str(tmp_path / "run"), ["--baseline.updates", "4", "--baseline.width", "8", "--baseline.batch", "4"]
+    assert main(["train", "turtlebot3", "--preset", "tiny", "--method", "pt-cql", *small, "--out", folder]) == 0
+    assert [row["method"] for row in pipeline.results(Path(folder))] == ["pt-cql", "planner", "explorer"]
+    for method in ("pt-cql", "planner"):
+        capsys.readouterr()
+        command = ["evaluate", folder, "--worlds", "1", "--pairs", "1", "--method", method, "--json"]
+        assert main(command) == 0 and json.loads(capsys.readouterr().out)["method"] == method

@@ -1,7 +1,10 @@
 """Every setting of the method is an option of ``ct-jax train``, and is stored in the settings of the run."""
 
+import ast
 import dataclasses
 import json
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -78,3 +81,56 @@ def test_help_all_lists_all_settings(capsys):
         if name != "rooms":
             assert f"--{name.replace('_', '-')}" in shown.replace(".no-", "."), name
     assert cli.main(["evaluate", "zoo:ant", "--help-all"]) == cli.BAD_INPUT
+
+
+# ---------------------------------------------------------------------------------------------------- their comments
+
+SOURCES = sorted(Path(cli.__file__).parent.rglob("*.py"))
+
+
+def wrong_comments(text: str) -> Iterator[str]:
+    """The settings whose comment ``--help-all`` does not show, or not whole, or shows for another setting.
+
+    It shows the comment on the line of the setting. Otherwise it shows the comment lines above it, or those above the
+    settings just before it.
+    """
+    lines = text.split("\n")
+    for config in ast.walk(ast.parse(text)):
+        if not isinstance(config, ast.ClassDef) or "Checked" not in map(ast.unparse, config.bases):
+            continue
+        for field in (part for part in config.body if isinstance(part, ast.AnnAssign)):
+            assert field.end_lineno is not None
+            beside = "  # " in lines[field.lineno - 1]
+            above = lines[field.lineno - 2].startswith("    # ")
+            goes_on = lines[field.end_lineno].startswith("    # ") and not lines[field.end_lineno][6].isupper()
+            if beside == above or goes_on or field.end_lineno > field.lineno:
+                yield f"{config.name}.{ast.unparse(field.target)}"
+
+
+@pytest.mark.parametrize("file", SOURCES, ids=lambda file: file.stem)
+def test_help_all_shows_the_comment_of_every_setting(file):
+    assert list(wrong_comments(file.read_text("utf-8"))) == []
+
+
+def test_a_wrong_comment_is_found():
+    lines = ["class A(Checked):", "    good: int = 1  # one", "    # Two.", "    fine: int = 2"]
+    assert list(wrong_comments("\n".join([*lines, ""]))) == []
+    lines += [
+        "    none: int = 3",
+        "    long: int = 4  # begins here, and",
+        "    # goes on",
+        "    b: int = (",
+        "  5)  # five",
+    ]
+    assert list(wrong_comments("\n".join([*lines, "    x = 1"]))) == ["A.none", "A.long", "A.b"]
+
+
+def test_help_all_shows_whole_comments(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")  # one column of options
+    assert cli.main(["train", "point", "--preset", "demo", "--help-all"]) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for part in (
+        "and the planner's action is imitated at every step (DAgger).",
+        "mirrored gait learns the mean of the two.",
+    ):
+        assert part in shown

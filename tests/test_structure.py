@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     *["runtime", "types", "worlds", "rollout", "learner", "prm", "guides", "pairs", "trajectories", "guided"],
     *["collect", "controllers", "controller", "dense", "transformer", "heads", "value", "fit", "policy", "agent"],
-    *["evaluate", "finetune", "baselines", "transfer", "settings", "configs", "model", "runtime.run", "report"],
+    *["evaluate", "finetune", "transfer", "settings", "configs", "model", "baselines", "runtime.run", "report"],
     *["worlds.mazes", "worlds.rooms", "worlds.maze_runs", "worlds.room_runs", "pipeline", "cli"],
 ]
 # What steps robots, and the worlds that hold it.

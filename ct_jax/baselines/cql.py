@@ -23,41 +23,75 @@ from flax import struct
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from ct_envs import Robot
+from ct_envs import Robot, UserError
 from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.frames import FrameName, symmetries
 from ct_envs.maze import Maze
-from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
-from ct_jax.learner import Info, learn
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, blank_policy, sample_seen, tanh_gaussian
+from ct_jax.learner import Info
+from ct_jax.learner import learn as learn_in_chunks
 from ct_jax.runtime.checkpoint import Checkpoints
 from ct_jax.runtime.devices import data_mesh, place, replicated, sharded
+from ct_jax.settings import Settings
 from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
+
+NAME = "pt-cql"
+TRAJECTORIES = True
 
 
 @dataclass(frozen=True)
 class CqlConfig(Checked):
     """Conservative Q-learning."""
 
-    updates: Count = 20_000
+    updates: Count = 20_000  # gradient updates
     batch: Annotated[int, Within(1, 1_000_000)] = 256  # number of single steps in a batch
     learning_rate: Annotated[float, Above(0, 1)] = 3e-4  # of policy, critics and temperature
     width: Annotated[int, Within(1, 16_384)] = 128  # of all layers
-    discount: Share = 0.99
+    discount: Share = 0.99  # of the return, for each step
     reward_scale: Annotated[float, Above(0, 1_000_000)] = 0.1  # of the reward [m] in the critics' units
     alpha: Annotated[float, Within(0, 1_000_000)] = 5.0  # weight of the conservative penalty against the squared error
-    samples: Annotated[int, Within(1, 10_000)] = (
-        10  # for the penalty: number of actions of each kind (uniform, policy at s, policy at s')
-    )
+    # For the penalty: number of actions of each kind (uniform, policy at s, policy at s').
+    samples: Annotated[int, Within(1, 10_000)] = 10
     target_rate: Annotated[float, Above(0, 1)] = 0.05  # share of the new critics in the target critics at each update
     temperature: Annotated[float, Within(0, 1000)] = 1.0  # initial weight of the policy's entropy; 0: no entropy term
-    entropy: Annotated[
-        float, Within(-1000, 1000)
-    ] = -1.0  # target entropy for each action dimension [nats]; the temperature adapts to it
+    # Target entropy for each action dimension [nats]. The temperature adapts to it.
+    entropy: Annotated[float, Within(-1000, 1000)] = -1.0
     soft_target: bool = False  # include the entropy in the critics' targets
-    imitation: Annotated[int, Within(0, 10**9)] = 0  # number of first updates in which the policy imitates the data,
-    # until the critics are useful
+    # Number of first updates in which the policy imitates the data, until the critics are useful.
+    imitation: Annotated[int, Within(0, 10**9)] = 0
     mirror: bool = False  # turn and reflect steps by a random symmetry of the robot
     frame: FrameName = "world"  # "heading": proprioception and actions are in the robot's own frame
+
+    @property
+    def total(self) -> int:
+        """Updates of the training."""
+        return self.updates
+
+
+Config = CqlConfig
+
+
+def config_for(settings: Settings, robot: Robot) -> CqlConfig:
+    """The settings that ``experiments/cql.py`` chose, in the controller's frame, and with the robot's symmetries."""
+    try:
+        symmetries(robot)
+    except UserError:
+        return CqlConfig(updates=2500, frame=settings.augment.frame)
+    return CqlConfig(updates=2500, mirror=True, frame=settings.augment.frame)
+
+
+def blank(run: Any, config: CqlConfig) -> ActorPolicy:
+    """A policy of the right sizes. Raises UserError for a frame or symmetries that the robot does not have."""
+    if config.mirror:
+        symmetries(run.spec)
+    return blank_policy(run.spec, config.width, config.frame)
+
+
+def learn(key: jax.Array, run: Any, config: CqlConfig, data: Trajectories | None, **watch: Any) -> ActorPolicy:
+    """Train on the run's trajectories."""
+    assert data is not None
+    learner = Cql(config, run.settings.model.map_cell_m, run.spec, data.action.shape[-1])
+    return train_cql(key, learner, data, run.stacked, **watch)
 
 
 @struct.dataclass
@@ -119,7 +153,7 @@ class Cql:
         )
         return place(jax.tree.map(jnp.array, fresh), replicated(self.mesh))
 
-    def update(self, data: Trajectories, mazes: Maze) -> tuple["Cql", Info]:
+    def update(self, data: Trajectories, mazes: Maze | None) -> tuple["Cql", Info]:
         """One update on a batch of single steps."""
         draw, noise = jax.random.split(jax.random.fold_in(self.key, self.step))
         window = sample_windows(
@@ -227,7 +261,7 @@ def train_cql(
     key: jax.Array,
     learner: Cql,
     data: Trajectories,
-    mazes: Maze,
+    mazes: Maze | None,
     *,
     on_progress: Callable[[int, dict[str, float]], None] = lambda update, metrics: None,
     checkpoints: Checkpoints | None = None,
@@ -237,13 +271,13 @@ def train_cql(
 
     Args:
         data: rewards are -||g|| to the final goal. The last step of a trajectory that did not arrive is not used.
-        mazes: stacked; ``data.maze`` is an index into it.
+        mazes: stacked; ``data.maze`` is an index into it. None if the trajectories keep their maps.
         on_progress: called with (updates done, metrics) after every ``chunk``.
         checkpoints: training continues from the last one, saves one at intervals, and saves one when interrupted.
     """
     learner = learner.create(key, data)
     data, mazes = place((data, mazes), replicated(learner.mesh))
-    learner = learn(
+    learner = learn_in_chunks(
         learner, learner.config.updates, data, mazes, on_progress=on_progress, checkpoints=checkpoints, chunk=chunk
     )
     return jax.device_get(learner.policy)

@@ -9,9 +9,13 @@ from brax.training.distribution import NormalTanhDistribution
 from flax import struct
 from jaxtyping import Array, Float, UInt8
 
+from ct_envs.frames import FrameName
 from ct_envs.occupancy import MAP_CELLS
+from ct_envs.robots import Robot
+from ct_jax.controllers.augment import check_frame
 from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_features, directions, goal_features
 from ct_jax.types import Action, Frame, act_as_intended
+from ct_jax.worlds import kind_of
 
 
 class Seen(NamedTuple):
@@ -99,6 +103,18 @@ class ActorPolicy:
     def act(self, memory: tuple[()], frame: Frame, key: jax.Array) -> tuple[Action, tuple[()]]:
         """The next actions in N environments with maps, and the empty memory."""
         del key
-        actor = Actor(self.action_size, self.width, self.frame)
-        logits: Any = actor.apply(self.params, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))
-        return act_as_intended(tanh_gaussian(self.action_size).mode(logits)), memory
+        return act_as_intended(_best(self, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))), memory
+
+
+@jax.jit  # some worlds step in NumPy
+def _best(policy: ActorPolicy, seen: Seen) -> Float[Array, "N A"]:
+    logits: Any = Actor(policy.action_size, policy.width, policy.frame).apply(policy.params, seen)
+    return tanh_gaussian(policy.action_size).mode(logits)
+
+
+def blank_policy(robot: Robot, width: int, frame: FrameName) -> ActorPolicy:
+    """A policy with the shapes of its parameters. Raises UserError for a frame that the robot does not have."""
+    check_frame(frame, robot)
+    proprio_size, action_size = kind_of(robot).sizes(robot)
+    params = jax.eval_shape(Actor(action_size, width, frame).init, jax.random.key(0), sample_seen(proprio_size))
+    return ActorPolicy(params, action_size, width, frame)

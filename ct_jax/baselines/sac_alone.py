@@ -7,7 +7,8 @@ them, exactly, when a batch is drawn.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,21 @@ from ct_envs.checked import Checked
 from ct_envs.frames import FrameName
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
-from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, sample_seen, tanh_gaussian
+from ct_envs.robots import Robot
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, blank_policy, sample_seen, tanh_gaussian
 from ct_jax.controllers.augment import check_frame
 from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.reward import Reward, RewardConfig
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.rollout import Environment
 from ct_jax.runtime.checkpoint import Checkpoints, run_to
+from ct_jax.settings import Settings
+from ct_jax.trajectories import Trajectories
+from ct_jax.worlds import kind_of
+
+NAME = "sac"
+TRAJECTORIES = False
+ITERATIONS = 8000  # 500 episodes of the point
 
 
 @dataclass(frozen=True)
@@ -35,8 +44,40 @@ class SacAloneConfig(Checked):
     """Settings of SAC alone."""
 
     sac: SacConfig = SacConfig()  # ``hidden[0]`` is the width of its networks
-    reward: RewardConfig = RewardConfig()
+    reward: RewardConfig = RewardConfig()  # terms of the reward
     frame: FrameName = "world"  # "heading": proprioception and actions are in the robot's own frame
+
+    @property
+    def total(self) -> int:
+        """Iterations of the training."""
+        return self.sac.iterations
+
+
+Config = SacAloneConfig
+
+
+def config_for(settings: Settings, robot: Robot) -> SacAloneConfig:
+    """The controller's learner in the whole maze. Longer paths need a larger discount factor."""
+    del robot
+    sac = replace(settings.sac, discount=0.99, iterations=ITERATIONS, reward_scale=0.1)
+    return SacAloneConfig(sac, replace(settings.edges.reward, alive_bonus=0.0), settings.augment.frame)
+
+
+def blank(run: Any, config: SacAloneConfig) -> ActorPolicy:
+    """A policy of the right sizes.
+
+    Raises:
+        UserError: the robot has no such frame, or does not drive in mazes.
+    """
+    kind_of(run.spec).make_env(run, maps=False)
+    return blank_policy(run.spec, config.sac.hidden[0], config.frame)
+
+
+def learn(key: jax.Array, run: Any, config: SacAloneConfig, data: Trajectories | None, **watch: Any) -> ActorPolicy:
+    """Train in the run's first maze, without data."""
+    del data
+    env_factory = functools.partial(kind_of(run.spec).make_env, run)
+    return train_sac_alone(key, env_factory, next(iter(run.mazes.values())), config, **watch)
 
 
 @functools.cache  # learners with the same networks share their compiled programs

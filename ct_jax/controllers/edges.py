@@ -29,12 +29,12 @@ from ct_jax.rollout import Environment
 class EdgeConfig(Checked):
     """The walk along an edge."""
 
-    reward: RewardConfig = RewardConfig()
+    reward: RewardConfig = RewardConfig()  # terms of the reward
     episode_steps: Annotated[int, Within(1, 1_000_000)] = 60  # control steps to walk an edge
-    reset_velocity_mps: Annotated[float, Within(0, 100)] = 2.0  # spread of the speed at an edge's start: on a plan, the
-    # robot arrives there moving
-    turn_ramp: Ramp | None = None  # a change of the first heading: from facing the goal to any heading; without it,
-    # always any heading
+    # Spread of the speed at an edge's start: on a plan, the robot arrives there moving.
+    reset_velocity_mps: Annotated[float, Within(0, 100)] = 2.0
+    # A change of the first heading: from facing the goal to any heading; without it, always any heading.
+    turn_ramp: Ramp | None = None
     held_out: Annotated[float, Within(0, 0.9)] = 0.1  # share of the edges kept for the final test
     relabel: Share = 0.0  # share of replayed steps that get a random goal around the robot: plans turn in any direction
     relabel_m: Annotated[float, Above(0, 10_000)] = 10.0  # largest distance of those goals [m]

@@ -21,15 +21,15 @@ Ramp = tuple[Share, Share]  # begin and end of a change, in shares of the traini
 class RewardConfig(Checked):
     """The terms of the reward in addition to progress or distance."""
 
-    arrival_bonus: Metres = (
-        10.0  # for reaching the goal; without it, the entropy bonus would make it better to stay away
-    )
-    fall_m: tuple[Metres, Metres] = (5.0, 20.0)  # cost of a fall: the value of staying this much farther away [m],
-    # at the beginning and at the end of training; with 60 m from the beginning, the ant does not learn to walk
+    # For reaching the goal; without it, the entropy bonus would make it better to stay away.
+    arrival_bonus: Metres = 10.0
+    # Cost of a fall: the value of staying this much farther away [m], at the beginning and at the end of training. With
+    # 60 m from the beginning, the ant does not learn to walk.
+    fall_m: tuple[Metres, Metres] = (5.0, 20.0)
     fall_ramp: Ramp = (0.2, 0.5)  # the change of ``fall_m``
     alive_bonus: Metres = 0.0  # reward of each step without a fall (paper, humanoid); replaces the cost of a fall
-    speed_mps: Annotated[float, Above(0, 1000)] | None = None  # velocity reward: speeds towards the goal
-    # above this one get no more reward
+    # Velocity reward: speeds towards the goal above this one get no more reward.
+    speed_mps: Annotated[float, Above(0, 1000)] | None = None
     action_cost: Metres = 0.0  # cost of a step with all actuators at their limits
     tilt_m: Metres = 0.0  # cost of a torso that lies on its side: that of this distance [m]
 

@@ -39,13 +39,14 @@ class SacConfig(Checked):
     average: Share = 0.0  # the result is a mean of policies with this decay at each update; 0: the last policy
     critic_norm: bool = False  # layer norm in the critics
     hidden: Annotated[tuple[Annotated[int, Within(1, 16_384)], ...], Within(1, 16)] = (256, 256)  # paper
-    discount: Share = 0.97
-    initial_temperature: Annotated[float, Above(0, 1000)] = 0.1
+    discount: Share = 0.97  # of the return, for each step
+    initial_temperature: Annotated[float, Above(0, 1000)] = 0.1  # first weight of the policy's entropy; it adapts
     target_rate: Annotated[float, Above(0, 1)] = 0.005  # share of the new critic in the target critic at each update
     reward_scale: Annotated[float, Above(0, 1_000_000)] = 1.0  # factor of the reward in the losses
     action_scale: Annotated[float, Above(0, 1)] = 1.0  # share of the actuators' range that the policy uses
-    greedy: Share = 0.0  # share of the environments with deterministic actions, as in later use: they visit states in
-    # which only random actions would make progress
+    # Share of the environments with deterministic actions, as in later use: they visit states in which only random
+    # actions would make progress.
+    greedy: Share = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

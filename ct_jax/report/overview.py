@@ -187,7 +187,7 @@ def _curves(run: Run) -> list[Block]:
     """The last training of each network."""
     several = list(curves_of(run))
     several = [c for c in several if c[1] != "reward"] or several
-    curves = list({curve[0].partition("-")[0]: curve for curve in several}.values())[:3]
+    curves = list({words.without_round(curve[0])[0]: curve for curve in several}.values())[:3]
     if not curves:
         return []
 

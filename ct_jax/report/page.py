@@ -17,7 +17,7 @@ from ct_envs.turtlebot3_world import World
 from ct_jax import __version__
 from ct_jax.report import pictures, words
 from ct_jax.report.pictures import LIGHT
-from ct_jax.report.reading import METHODS, STAGES, Curve, Episodes, Run, number
+from ct_jax.report.reading import STAGES, Curve, Episodes, Run, number
 from ct_jax.runtime.terminal import printable
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # forbids the browser to load anything
@@ -59,6 +59,7 @@ CURVES = {  # the curves of a stage: the scalar, its description, and the option
     ),
     "value": (("loss", "loss", {"log": True}),),
     "fit": (("loss", "loss", {"log": True}),),
+    "pt-cql": (("error", "squared error of the critics", {"log": True}), ("gap", "conservative penalty", {})),
 }
 _ANY_CURVE = (
     ("success", "success", {"rate": True}),
@@ -165,7 +166,8 @@ def _results(run: Run) -> str:
     mazes = list(dict.fromkeys(row["maze"] for row in run.rows))
     tables = [_table(run, maze, [row for row in run.rows if row["maze"] == maze]) for maze in mazes]
     lead = f'<p class="lead">{_text(words.verdict(run))}</p>'
-    methods = {words.METHOD_LABELS[m]: words.METHOD_NOTES[m] for m in METHODS if m in {r["method"] for r in run.rows}}
+    present = dict.fromkeys(row["method"] for row in run.rows)
+    methods = {words.METHOD_LABELS[m]: words.METHOD_NOTES[m] for m in present if m in words.METHOD_NOTES}
     shown = {name for name, *_ in _columns(run)}
     terms = methods | {name: text for name, text in _GLOSSARY.items() if name in shown}
     terms = "".join(f"<li><b>{_text(k)}</b>: {_text(v)}.</li>" for k, v in terms.items())
@@ -239,7 +241,8 @@ def _mazes(run: Run) -> str:
             note = " with a roadmap of {} and {}".format(*parts)
         svg = pictures.to_svg(figure, f"{'' if rooms else 'Maze '}{name}, {size}{note}.")
         figures.append(_figure(svg, name, size + note, _seen_tag(run.seen.get(name, False))))
-    lead = "The planner knows these maps. The transformer sees only the walls near the robot."
+    method = words.method_label(run.method)
+    lead = f"The planner knows these maps. The {_text(method)} sees only the walls near the robot."
     if besides := _random_mazes(run):
         lead += f" It was also trained in {words.count(besides, 'random maze')}."
     if besides := _random_mazes(run, "recover"):
@@ -248,7 +251,7 @@ def _mazes(run: Run) -> str:
     more = len(run.walls) - len(figures)
     rest = f'<p class="quiet">{words.count(more, "other " + ("room" if rooms else "maze"))} not drawn.</p>'
     rest = rest if more else ""
-    missing = "" if run.roadmap or rooms else _missing("No roadmap", "prm/roadmap.npz")
+    missing = "" if run.roadmap or rooms or run.is_baseline else _missing("No roadmap", "prm/roadmap.npz")
     return _section(title, lead, _grid(figures, "wide"), rest, missing)
 
 
@@ -401,7 +404,7 @@ def _pick_successes(mine: list[Episodes]) -> list[tuple[Episodes, int]]:
 def curves_of(run: Run) -> Iterator[tuple[str, str, Curve, dict[str, bool]]]:
     """The learning curves to draw: stage, description, curve, and options of ``draw_curve``."""
     for stage, named in run.curves.items():
-        wanted = CURVES.get(stage.partition("-")[0], _ANY_CURVE)
+        wanted = CURVES.get(words.without_round(stage)[0], _ANY_CURVE)
         for name, what, how in wanted:
             if name in named:
                 yield stage, what, named[name], how
@@ -436,6 +439,8 @@ def _calibration(run: Run) -> str:
         name = f"{episodes.maze}" + ("" if episodes.method == "ct" else f", {words.method_label(episodes.method)}")
         svg = pictures.to_svg(figure, f"Actual return against target return, {name}: {note}.")
         figures.append(_figure(svg, name, note, _seen_tag(episodes.seen)))
+    if not figures and run.is_baseline:
+        return ""
     if not figures:
         return _section(title, _missing("No target returns", "evaluate/*-ct.npz"))
     lead = "The value network predicts the target return at the start. On the dashed line, both returns are equal. "

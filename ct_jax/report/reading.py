@@ -17,7 +17,7 @@ from ct_envs.maze import CELL_M, parse_walls
 from ct_envs.turtlebot3_world import World, make_world
 
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate")
-METHODS = ("ct", "planner", "explorer")  # order in the report; other methods follow
+METHODS = ("planner", "explorer")  # order in the report after the run's own; other methods follow
 ROOMS = "rooms"  # the name of all rooms of an evaluation in its files
 _ROOM_CELL_M = 0.5  # in rooms, a robot that moves less than this is stuck [m]
 
@@ -56,6 +56,7 @@ class Run:
 
     folder: Path
     config: dict[str, Any]
+    method: str  # that was trained
     cell_m: float
     walls: dict[str, Place]  # mazes (training mazes first) or rooms
     seen: dict[str, bool]
@@ -66,6 +67,11 @@ class Run:
     horizon: int  # number of steps of the longest episode
     roadmap: tuple[np.ndarray, np.ndarray] | None  # points [n, 2] (m), edges [m, 2]
     done: dict[str, dict[str, Any]]  # by stage
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether a baseline was trained: it has no target returns, and needs no roadmap."""
+        return "baseline" in self.config
 
 
 def read_run(folder: Path) -> Run:
@@ -80,15 +86,17 @@ def read_run(folder: Path) -> Run:
     rooms = _read_rooms(folder / "evaluate" / "rooms.json")
     walls |= rooms
     seen = dict.fromkeys(unseen_mazes, False) | dict.fromkeys(seen_mazes, True)
-    rows = _read_rows(folder / "evaluate" / "results.json")
+    method = str(config.get("method", "ct"))
+    rows = _read_rows(folder / "evaluate" / "results.json", method)
     seen = {row["maze"]: bool(row.get("seen")) for row in rows} | seen
     cell_m = number(config.get("cell_m"))
-    tested = list(_read_episodes(folder / "evaluate", rows, seen))
+    tested = list(_read_episodes(folder / "evaluate", rows, seen, method))
     episodes = [part for each in tested for part in (_by_room(each, list(rooms)) if each.maze == ROOMS else [each])]
     seen |= dict.fromkeys(rooms, False)
     return Run(
         folder=folder,
         config=config,
+        method=method,
         cell_m=_ROOM_CELL_M if rooms else cell_m if cell_m and cell_m > 0 else CELL_M,
         walls=walls,
         seen=seen,
@@ -98,7 +106,7 @@ def read_run(folder: Path) -> Run:
         horizon=max((int(e.steps.max()) for e in episodes), default=0),
         curves=_read_curves(folder / "metrics.jsonl"),
         roadmap=_read_roadmap(folder / "prm" / "roadmap.npz"),
-        done={s: done for s in STAGES if isinstance(done := read_json(folder / s / "done.json"), dict)},
+        done=dict(_read_done(folder)),
     )
 
 
@@ -158,12 +166,20 @@ def _read_rooms(path: Path) -> dict[str, Place]:
     return rooms
 
 
-def _read_rows(path: Path) -> list[dict[str, Any]]:
+def _read_done(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The finished stages, and before the evaluation those of baselines by their names."""
+    *stages, last = (folder / stage for stage in STAGES)
+    for stage in (*stages, *sorted(folder.glob("baselines/*")), last):
+        if isinstance(done := read_json(stage / "done.json"), dict):
+            yield stage.name, done
+
+
+def _read_rows(path: Path, method: str) -> list[dict[str, Any]]:
     found = read_json(path)
     rows = found.get("rows") if isinstance(found, dict) else None
     rows = rows if isinstance(rows, list) else []
     rows = [row | {"maze": str(row["maze"]), "method": str(row["method"])} for row in rows if _is_row(row)]
-    order = [*METHODS, *dict.fromkeys(row["method"] for row in rows)]
+    order = [method, *METHODS, *dict.fromkeys(row["method"] for row in rows)]
     mazes = list(dict.fromkeys(row["maze"] for row in rows))
     return sorted(rows, key=lambda r: (not r.get("seen"), mazes.index(r["maze"]), order.index(r["method"])))
 
@@ -195,8 +211,8 @@ def _read_roadmap(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     return (points, edges) if inside else None
 
 
-def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, bool]) -> Iterator[Episodes]:
-    methods = dict.fromkeys((*METHODS, *(row["method"] for row in rows)))
+def _read_episodes(folder: Path, rows: list[dict[str, Any]], seen: dict[str, bool], method: str) -> Iterator[Episodes]:
+    methods = dict.fromkeys((method, *METHODS, *(row["method"] for row in rows)))
     for maze, method in product(sorted(seen, key=lambda name: not seen[name]), methods):
         arrays = _read_arrays(folder / f"{slug(maze)}-{slug(method)}.npz")
         path, success = arrays.get("path"), arrays.get("success")

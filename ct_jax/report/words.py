@@ -10,8 +10,14 @@ from ct_envs.turtlebot3_world import World
 from ct_jax.report.pictures import track
 from ct_jax.report.reading import Episodes, Place, Run, number
 
-METHOD_LABELS = {"ct": "Control Transformer", "planner": "Planner with the full map", "explorer": "Explorer"}
+METHOD_LABELS = {
+    "ct": "Control Transformer", "bc-ct": "BC-CT", "pt-cql": "PT-CQL", "sac": "SAC alone",
+    "planner": "Planner with the full map", "explorer": "Explorer",
+}  # fmt: skip
 METHOD_NOTES = {
+    "bc-ct": "the transformer without returns: it imitates the trajectories",
+    "pt-cql": "conservative Q-learning on the same trajectories, with the same observations, but without memory",
+    "sac": "learned in the whole maze, without planner and without trajectories",
     "ct": "observes only its surroundings and the vector to the goal; it has no map and no planner",
     "planner": "knows the whole maze; it shows the best result of this low-level controller",
     "explorer": "builds a map from the same local maps, and plans as if unknown space were free",
@@ -45,8 +51,16 @@ def stage_label(stage: str, *, timing: bool = False) -> str:
     """
     if timing and stage == "fit":
         return "Value and transformer"
-    base, _, again = stage.partition("-")
+    base, again = without_round(stage)
+    if base in METHOD_LABELS and base not in STAGE_LABELS:
+        return METHOD_LABELS[base]
     return STAGE_LABELS.get(base, base) + (f", fine-tuning {again}" if again else "")
+
+
+def without_round(stage: str) -> tuple[str, str]:
+    """A stage and its round of fine-tuning: "fit-1" is "fit" and "1"; the second is empty if there is none."""
+    base, _, again = stage.rpartition("-")
+    return (base, again) if base and again.isdecimal() else (stage, "")
 
 
 def percent(rate: float) -> str:
@@ -77,9 +91,9 @@ def count(n: int, one: str) -> str:
 
 
 def main_method(run: Run) -> str:
-    """The method that the report is about: the transformer, or the first method."""
+    """The method that the report is about: that of the run, or else the first one."""
     methods = [row["method"] for row in run.rows] or [e.method for e in run.episodes]
-    return "ct" if "ct" in methods or not methods else methods[0]
+    return run.method if run.method in methods or not methods else methods[0]
 
 
 def headline(run: Run) -> str:

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -25,9 +25,12 @@ from typing import Any
 import jax
 
 from ct_envs import Maze, UserError, load_maze, make_maze, maze_names, random_walls, stack_mazes
-from ct_envs.maze import draw_walls, unpadded
+from ct_envs.checked import Checked, from_json
+from ct_envs.maze import draw_walls, parse_walls, unpadded
 from ct_envs.robots import Robot, get_robot
 from ct_jax import __version__
+from ct_jax.baselines import TRANSFORMERS, get_baseline
+from ct_jax.configs import find_robot
 from ct_jax.evaluate import Episodes
 from ct_jax.runtime import devices
 from ct_jax.runtime.checkpoint import Checkpoints, read_json, write_json
@@ -36,7 +39,10 @@ from ct_jax.runtime.progress import Bar, Metrics
 from ct_jax.settings import Settings, from_dict, to_dict
 
 _ROW = {"method", "maze", "success_rate", "success_ci95", "spl", "return_scaled", "collision_rate", "steps_mean"}
+BASELINES = "baselines"  # the folder in which each baseline has its stage
 STAGES = ("prm", "controller", "collect", "fit", "finetune", "evaluate", "report")
+
+_EARLIER = {"method": "ct"}  # what the config.json of an earlier version does not say
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,8 @@ class Run:
     eval_mazes: dict[str, Maze]  # further mazes for the evaluation
     seed: int
     engine: str
+    method: str = "ct"  # what is trained: a transformer, or a baseline
+    baseline: Checked | None = None  # the settings of a baseline
 
     def key(self, stage: str) -> jax.Array:
         """The random key of a stage."""
@@ -64,6 +72,11 @@ class Run:
     def spec(self) -> Robot:
         """The robot."""
         return get_robot(self.robot)
+
+    @property
+    def trained(self) -> Path:
+        """The folder of what the run has trained: a model, or a baseline."""
+        return self.folder / ("model" if self.baseline is None else f"{BASELINES}/{self.method}")
 
     @property
     def stacked(self) -> Maze | None:
@@ -282,9 +295,10 @@ def open_run(run: Run, *, resume: bool) -> Iterator[None]:
             config = run.folder / "config.json"
             if not config.is_file():
                 write_json(config, identity(run) | provenance())
-            for stage in STAGES:  # a process may have been killed between the end of a stage and its cleanup
-                if (run.folder / stage / "done.json").is_file():
-                    drop_leftovers(run.folder / stage)
+            # A process may have been killed between the end of a stage and its cleanup.
+            for stage in (*map(run.folder.joinpath, STAGES), *run.folder.glob(f"{BASELINES}/*")):
+                if (stage / "done.json").is_file():
+                    drop_leftovers(stage)
 
         devices.first(begin)
         yield
@@ -326,16 +340,76 @@ def identity(run: Run) -> dict[str, Any]:
     return {
         "robot": run.robot,
         "preset": run.preset,
+        "method": run.method,
         "seed": run.seed,
         "engine": run.engine,
         "mazes": texts[0],
         "eval_mazes": texts[1],
         "settings": settings,
-    }
+    } | ({} if run.baseline is None else {"baseline": as_json(run.baseline)})
+
+
+def as_json(config: Checked) -> dict[str, Any]:
+    """A config as it is read from a file: tuples become lists."""
+    return json.loads(json.dumps(asdict(config)))
+
+
+def stored_run(folder: Path) -> Run:
+    """The run in a folder.
+
+    Raises:
+        UserError: the folder is not the folder of a run, or its ``config.json`` is damaged.
+    """
+    file = folder / "config.json"
+    if not file.is_file():
+        raise UserError(f"{folder}: no run folder; give one that 'ct-jax train' wrote")
+    config = _EARLIER | read_json(file, hint="restore it")
+    try:
+        settings, mazes = from_dict(config["settings"]), [_mazes_of(config[name]) for name in ("mazes", "eval_mazes")]
+        words = {name: str(config[name]) for name in ("robot", "preset", "engine", "method")}
+        baseline = None
+        if words["method"] not in TRANSFORMERS:
+            baseline = from_json(get_baseline(words["method"]).Config, config["baseline"], "baseline")
+        robot = find_robot(words["robot"]).name
+        return Run(
+            folder=folder, settings=settings, mazes=mazes[0], eval_mazes=mazes[1], seed=int(config["seed"]),
+            baseline=baseline, **words | {"robot": robot},
+        )  # fmt: skip
+    except (UserError, KeyError, TypeError, ValueError) as bad:
+        reason = str(bad) if isinstance(bad, UserError) else f"{type(bad).__name__}: {bad}"
+        raise UserError(f"{file}: not a run's configuration ({reason}); restore it") from None
+
+
+def _mazes_of(texts: dict[str, str]) -> dict[str, Maze]:
+    """The mazes that ``maze_text`` wrote."""
+    return {name: make_maze(parse_walls(text, source=name)) for name, text in texts.items()}
+
+
+def claim(file: Path, inputs: dict[str, Any], what: str) -> dict[str, Any]:
+    """Record the inputs of the results in a file's folder; returns the record, with the provenance of the first one.
+
+    Args:
+        what: the name of the inputs in the error.
+
+    Raises:
+        UserError: the results in the folder have other inputs.
+    """
+    inputs = json.loads(json.dumps(inputs, default=str))  # tuples become lists, as when the file is read
+
+    def record() -> dict[str, Any]:
+        if not file.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_json(file, {"of": inputs} | provenance())
+        return read_json(file)
+
+    before = devices.first(record)
+    if before.get("of") != inputs:
+        raise UserError(f"{file.parent}: was made with other {what}; delete it to make it again")
+    return before
 
 
 def _check_same(run: Run, config: Path) -> None:
-    before = read_json(config, hint="restore it, or choose another folder with --out")
+    before = _EARLIER | read_json(config, hint="restore it, or choose another folder with --out")
     before |= {"settings": _settings_of(config, before.get("settings"))}
     for name, now in identity(run).items():
         found = _difference(name, before.get(name), now)
@@ -357,7 +431,7 @@ def _difference(name: str, before: Any, now: Any) -> str:
         return ""
     if isinstance(before, dict) and isinstance(now, dict):
         if list(before) != list(now):
-            of_version = name.startswith("settings")
+            of_version = name.startswith(("settings", "baseline"))
             return f"{name} of another version" if of_version else f"{name} {', '.join(before)}, not {', '.join(now)}"
         return next(found for key in now if (found := _difference(f"{name}.{key}", before[key], now[key])))
     if isinstance(now, str) and "\n" in now:

@@ -56,6 +56,10 @@ class Kind(Protocol):
         """The world of a run's collection (without local maps, where they can be recomputed) and recoveries."""
         ...
 
+    def make_env(self, run: Any, **options: Any) -> Any:
+        """The ``rollout.Environment`` in which many robots learn side by side. Raises UserError if there is none."""
+        ...
+
     def controller(self, run: Any, metrics: Any) -> tuple[Any, Any]:
         """pi_c, learned, read back or known, and its configuration."""
         ...

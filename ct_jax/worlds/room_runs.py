@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -37,6 +37,12 @@ def sizes(robot: Robot) -> tuple[int, int]:
     """Entries of a robot's proprioception and of its action."""
     del robot
     return PROPRIO_SIZE, ACTION_SIZE
+
+
+def make_env(run: Run, **options: Any) -> NoReturn:
+    """Rooms are not stepped by JAX. Raises UserError."""
+    del options
+    raise UserError(f"the {run.robot} drives in PyBullet: no method can learn in it without trajectories")
 
 
 @contextmanager
