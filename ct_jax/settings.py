@@ -157,7 +157,7 @@ def _part_1(name: str, values: Any) -> Any:
     """A part of format 1 under its new names, with what was left out."""
     if not isinstance(values, dict):
         return values
-    return _ABSENT_1.get(name, {}) | {_NAMES_1.get(key, key): value for key, value in values.items()}
+    return _ABSENT_1.get(name, {}) | {_NAMES_1.get(entry, entry): value for entry, value in values.items()}
 
 
 def _settings_2(values: Any) -> Any:

@@ -29,7 +29,7 @@ def test_controller_reaches_goal_from_any_pose(controller, seed):
     position, yaw = rng.uniform(-3, 3, (64, 2)), rng.uniform(-np.pi, np.pi, 64)
     yaw[:4] = np.arctan2(position[:4, 1], position[:4, 0])  # the goal is behind the robot
     for _ in range(400):
-        position, yaw = move(position, yaw, controller(to_heading(-position, yaw)))
+        position, yaw = move(position, yaw, controller(None, to_heading(-position, yaw)))
     assert np.linalg.norm(position, axis=-1).max() < 0.05
 
 
@@ -38,7 +38,7 @@ def test_controller_reaches_goal_from_any_pose(controller, seed):
 @settings(max_examples=20)
 def test_controller_respects_limits_and_never_reverses(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(50, 2)) * 10.0 ** np.arange(-4, 1).repeat(10)[:, None]
-    v, omega = speeds(controller(goals)).T
+    v, omega = speeds(controller(None, goals)).T
     assert (v >= 0).all() and v.max() <= TOP_SPEED_MPS and np.abs(omega).max() <= TOP_TURN_RADPS
 
 
@@ -49,7 +49,7 @@ def test_controller_is_proportional_below_saturation(seed):
     rng = np.random.default_rng(seed)
     distance, angle = rng.uniform(0, 0.2, 20), rng.uniform(-0.9, 0.9, 20)
     goals = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    v, omega = speeds(DifferentialDrive(1.0, 3.0, 0.0)(goals)).T
+    v, omega = speeds(DifferentialDrive(1.0, 3.0, 0.0)(None, goals)).T
     np.testing.assert_allclose(v, distance, atol=1e-12)
     np.testing.assert_allclose(omega, 3.0 * angle, atol=1e-9)
 
@@ -59,12 +59,12 @@ def test_controller_is_proportional_below_saturation(seed):
 @settings(max_examples=20)
 def test_controller_is_mirror_symmetric(controller, seed):
     goals = np.random.default_rng(seed).normal(size=(20, 2))
-    np.testing.assert_allclose(controller(goals * [1, -1]), controller(goals) * [1, -1], atol=1e-12)
+    np.testing.assert_allclose(controller(None, goals * [1, -1]), controller(None, goals) * [1, -1], atol=1e-12)
 
 
 def test_controller_turns_before_driving():
-    assert speeds(DifferentialDrive()(np.array([-1.0, 1.0]))).tolist() == [0.0, TOP_TURN_RADPS]
-    assert DifferentialDrive()(np.zeros(2)).tolist() == [0.0, 0.0]
+    assert speeds(DifferentialDrive()(None, np.array([-1.0, 1.0]))).tolist() == [0.0, TOP_TURN_RADPS]
+    assert DifferentialDrive()(None, np.zeros(2)).tolist() == [0.0, 0.0]
 
 
 @given(SEEDS)

@@ -249,7 +249,7 @@ def policy():
 def test_the_transformer_is_asked_for_its_value(policy, pairs):
     env = MazeEnv(POINT, engine="mujoco", auto_reset=False, horizon=50)
     few = replace(pairs["antmaze-large"], **{
-        name: getattr(pairs["antmaze-large"], name)[:2] for name in ("start", "goal", "shortest_m")
+        name: getattr(pairs["antmaze-large"], name)[:2] for name in ("start", "goal", "shortest_m", "place")
     })  # fmt: skip
     seen = []
     done = evaluate(

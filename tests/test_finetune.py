@@ -177,8 +177,12 @@ def test_a_policy_that_never_fails_and_a_planner_that_never_saves_end(push):
     options = {"recoveries": 2, "give_up": 8.0, "keep": "joined"}
     with pytest.raises(UserError, match="no recovery in 16 episodes"):
         recoveries(Blind(push(0.0)), push, gain=0.0, **options)
+    walls = np.ones((7, 7), bool)
+    walls[1:-1, 1:-1] = False
+    world = MazeWorld(ENV, make_maze(walls))  # without walls in between, the policy always arrives
+    config = replace(CONFIG, stuck_m=0.0, patience=150, **options)
     with pytest.raises(UserError, match="hardly fails"):
-        recoveries(Blind(push()), push, patience=10**6, stuck_m=0.0, **options)
+        recover(jax.random.key(0), world, Blind(push()), push(), config, COLLECTING, PRM)
 
 
 def test_without_compilation(push):

@@ -14,6 +14,7 @@ from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.sac import SacConfig
 from ct_jax.evaluate import Pairs, evaluate
 from ct_jax.runtime.checkpoint import Checkpoints
+from ct_jax.worlds.mazes import MazeWorld
 
 pytestmark = pytest.mark.rank_promotion("allow")  # brax's replay
 
@@ -113,9 +114,9 @@ def test_the_policy_can_be_evaluated(whole):
     """By the same function as all methods; without chance, and with no return to ask for."""
     pairs = Pairs(np.float32([[6, 6], [6, 14]]), np.float32([[12, 6], [6, 6]]), np.float32([6, 8]), 0)
     env = ENV(auto_reset=False)
-    once, again = (evaluate(env, UMAZE, pairs, "sac", policy=whole) for _ in range(2))
+    once, again = (evaluate(MazeWorld(env, UMAZE), pairs, "sac", policy=whole) for _ in range(2))
     np.testing.assert_array_equal(once.path, again.path)
-    assert once.path.shape == (5, 2, 2) and once.asked is None
+    assert once.path.shape == (5, 2, 2) and once.target_return is None
     assert (once.returns < 0).all()
 
 

@@ -21,8 +21,8 @@ _SHARED = "base"  # a file that is no robot's
 
 def find_robot(name: str, simulator: str | None = None) -> Robot:
     """The robot of that name, be it one that its file here registers. Raises UserError with the valid names."""
-    if name not in ROBOTS:  # the files take a second or two
-        _all_presets()
+    if name not in ROBOTS and name in _files():  # its file may register it
+        importlib.import_module(f"{__name__}.{name}")
     return get_robot(name, simulator)
 
 
@@ -39,5 +39,9 @@ def get_preset(name: str, robot: str = "point") -> "Settings":
 
 def _all_presets() -> dict[str, dict[str, "Settings"]]:
     """The presets of each robot with a file in this folder."""
-    names = sorted(found.name for found in pkgutil.iter_modules(__path__) if found.name != _SHARED)
-    return {name: importlib.import_module(f"{__name__}.{name}").PRESETS for name in names}
+    return {name: importlib.import_module(f"{__name__}.{name}").PRESETS for name in _files()}
+
+
+def _files() -> list[str]:
+    """The robots with a file in this folder."""
+    return sorted(found.name for found in pkgutil.iter_modules(__path__) if found.name != _SHARED)

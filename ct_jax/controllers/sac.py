@@ -59,13 +59,14 @@ def make_networks(
     input_size: int, action_size: int, hidden: tuple[int, ...], *, critic_norm: bool = False
 ) -> sac_networks.SACNetworks:
     """Policy and critics for inputs and actions of these sizes."""
-    return sac_networks.make_sac_networks(
-        input_size,
-        action_size,
-        preprocess_observations_fn=running_statistics.normalize,
-        hidden_layer_sizes=hidden,
-        q_network_layer_norm=critic_norm,
-    )
+    with jax.ensure_compile_time_eval():  # the result is kept, so it must not hold tracers
+        return sac_networks.make_sac_networks(
+            input_size,
+            action_size,
+            preprocess_observations_fn=running_statistics.normalize,
+            hidden_layer_sizes=hidden,
+            q_network_layer_norm=critic_norm,
+        )
 
 
 def blank_statistics(size: int) -> running_statistics.RunningStatisticsState:

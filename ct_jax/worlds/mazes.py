@@ -139,14 +139,14 @@ class MazeWorld:
         """n pairs of free points of one region in each maze, a goal never within twice the tolerance of its start."""
         robot, parts = self.robot, []
         for number in range(self.places):
-            maze, key = self._maze(number), jax.random.key(seed)
-            key = key if number == 0 else jax.random.fold_in(key, number)
-            keys = jax.random.split(key, 8 * n + 64)
+            maze, keys = self._maze(number), jax.random.split(_key_of(seed, number), 8 * n + 64)
             draw = jax.jit(jax.vmap(lambda key, maze=maze: sample_pair(key, maze, radius=robot.radius_m)))
             start, goal = map(np.asarray, draw(keys))
             apart = np.flatnonzero(np.linalg.norm(start - goal, axis=1) > 2 * robot.goal_tolerance_m)[:n]
             ends = np.stack([start[apart], goal[apart]], 1)
-            parts.append((ends, *shortest_ways(key, maze, ends, radius_m=robot.radius_m, config=_DENSE)))
+            parts.append(
+                (ends, *shortest_ways(_key_of(seed, number), maze, ends, radius_m=robot.radius_m, config=_DENSE))
+            )
         ends, shortest = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         number = np.repeat(np.arange(self.places), [len(part[0]) for part in parts])
         return Pairs(ends[:, 0], ends[:, 1], shortest, seed, number, straight=sum(part[2] for part in parts))
@@ -209,6 +209,12 @@ class MazeWorld:
         flags = (last[name] > 0 for name in ("success", "fall", "diverged"))
         end = End(last["position"], last["reward"], *flags)
         return Rollout(steps, end, last["goal"], own_rows(tasks.place), own_rows(tasks.counted), horizon)
+
+
+def _key_of(seed: int, number: int) -> jax.Array:
+    """The key of a maze's pairs. The roadmap for the shortest ways has the same one, as in all published pairs."""
+    key = jax.random.key(seed)
+    return key if number == 0 else jax.random.fold_in(key, number)
 
 
 def start_episodes(env: MazeEnv, keys: jax.Array, maze: Maze, start: Any, goal: Any) -> State:
