@@ -235,6 +235,8 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
     Args:
         go_on: the message after Ctrl-C: how to continue.
     """
+    global _stopped
+    _stopped = False
     show_anything()
     go_on = printable(go_on)
     try:
@@ -252,7 +254,6 @@ def guarded(action: Callable[[], None], *, go_on: str = "the same command contin
         where = f"{bad.filename}: " if bad.filename else ""
         return _fail(f"{where}{bad.strerror or bad}; make room or choose another place; finished work is kept")
     except KeyboardInterrupt as stop:
-        global _stopped
         _stopped = True
         _say(f"stopped; {go_on}")
         return 0 if isinstance(stop, Terminated) else INTERRUPTED

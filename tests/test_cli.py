@@ -513,3 +513,16 @@ def test_incomplete_process_options_are_error_of_one_line(capsys, command, optio
     assert main([*command, *options.split()]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and said in error and error.count("\n") == 1
+
+
+def test_interrupted_program_does_not_end_the_next_one(monkeypatch):
+    """Only the program that a signal stopped ends at once; another one in the same process ends as usual."""
+
+    def stop():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "_exit", lambda status: pytest.fail("it ended at once"))
+    assert cli.guarded(stop) == cli.INTERRUPTED
+    assert cli.guarded(lambda: None) == 0
+    with pytest.raises(SystemExit):
+        cli.leave(0)
