@@ -17,6 +17,9 @@ from ct_envs.fine import fit_maze, load_fitted, merge_walls, wall_distance
 from ct_envs.maze import clearance, load_walls, sample_pair, segment_free, segment_reach
 from ct_envs.occupancy import local_map
 from ct_envs.physics import PhysicsState, add_wall, make_engine, model_xml, nearest_walls
+from ct_jax.evaluate import evaluate
+from ct_jax.prm import PrmConfig
+from ct_jax.worlds.mazes import MazeWorld
 from tests.refusals import refusal
 
 pytestmark = pytest.mark.rank_promotion("allow")  # MJX
@@ -296,6 +299,16 @@ def test_the_local_map_shows_walls_that_are_thinner_than_its_cells(seed, cell_m,
             inside = walls[max(bottom, 0) : max(top, 0), max(left, 0) : max(right, 0)]
             beyond = bottom < 0 or left < 0 or top > height or right > width
             assert bool(shown[i, j]) == (beyond or bool(inside.any()))
+
+
+def test_methods_are_evaluated_in_a_fine_maze(push):
+    """By the world that evaluates them in any other maze."""
+    maze = hall()
+    env = MazeEnv("point", maze=maze, cell_m=0.1, engine="mujoco", auto_reset=False, horizon=40)
+    world = MazeWorld(env, maze)
+    pairs = world.draw_pairs(0, 3)
+    done = evaluate(world, pairs, "planner", controller=push(), prm=PrmConfig(samples=30))
+    assert done.path.shape[1:] == (3, 2) and done.travelled_m.min() > 0.5
 
 
 # ------------------------------------------------------------------------------------------------- what is refused

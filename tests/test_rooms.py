@@ -24,6 +24,8 @@ from ct_jax.evaluate import METHODS, Episodes, evaluate
 from ct_jax.finetune import RecoverConfig, recover
 from ct_jax.fit import FitConfig
 from ct_jax.model import load_model
+from ct_jax.pairs import Pairs
+from ct_jax.runtime.run import episodes_file, kept_row
 from ct_jax.trajectories import load, unpack_maps
 from ct_jax.types import act_as_intended
 from ct_jax.worlds.room_runs import SevenPairs, grades
@@ -298,3 +300,15 @@ def test_pt_cql_is_trained_and_evaluated_in_rooms(tmp_path, monkeypatch, capsys)
         capsys.readouterr()
         command = ["evaluate", folder, "--worlds", "1", "--pairs", "1", "--method", method, "--json"]
         assert main(command) == 0 and json.loads(capsys.readouterr().out)["method"] == method
+
+
+def test_episodes_of_a_single_room_name_it(tmp_path):
+    """The report draws episodes by room, also where there is only one."""
+    ones, pairs = np.ones(3), Pairs(np.zeros((3, 2)), np.ones((3, 2)), np.ones(3), 0)
+    episodes = Episodes(
+        success=ones > 0, collided=ones < 0, fell=ones < 0, timeout=ones < 0, steps=4 * ones, returns=-ones,
+        travelled_m=ones, path=np.zeros((4, 3, 2), np.float32), pairs=pairs, wall_s=1.0, horizon=4,
+    )  # fmt: skip
+    kept_row(tmp_path, "rooms", "ct", {"robot": "turtlebot3", "method": "ct", "maze": "rooms"}, lambda: episodes)
+    with np.load(episodes_file(tmp_path, "rooms", "ct")) as arrays:
+        np.testing.assert_array_equal(arrays["world"], [0, 0, 0])

@@ -210,8 +210,7 @@ def _save_episodes(file: Path, episodes: Episodes) -> None:
     arrays = {name: getattr(episodes, name) for name in ("path", "success", "collided", "fell", "steps", "returns")}
     arrays |= {"start": episodes.pairs.start, "goal": episodes.pairs.goal}
     more = {name: getattr(episodes, name) for name in ("frontal", "grazing", "diverged")}
-    place = episodes.pairs.place
-    more |= {"asked": episodes.target_return, "world": place if place.any() else None}
+    more |= {"asked": episodes.target_return, "world": episodes.pairs.place}
     arrays |= {name: array for name, array in more.items() if array is not None}
     save_arrays(file, **arrays)
 

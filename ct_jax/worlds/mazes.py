@@ -10,7 +10,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Int
 
-from ct_envs import MazeEnv, check_tasks, stack_mazes
+from ct_envs import MazeEnv, check_tasks
 from ct_envs import Tasks as Episodes
 from ct_envs.maze import Maze, sample_pair
 from ct_envs.robots import Robot
@@ -54,7 +54,7 @@ class MazeWorld:
 
     def __post_init__(self) -> None:
         if self.mazes.walls.ndim == 2:
-            object.__setattr__(self, "mazes", stack_mazes([self.mazes]))
+            object.__setattr__(self, "mazes", jax.tree.map(lambda leaf: leaf[None], self.mazes))
 
     @property
     def robot(self) -> Robot:
