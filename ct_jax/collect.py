@@ -143,6 +143,7 @@ def kept_in(folder: Path, *, hint: str) -> Callable[[RunWave], RunWave]:
                 flags = [joined(each).tolist() for each in (wave.success, wave.broke_off)]
                 in_first(lambda: write_json(flags_file, {"flags": flags}))
                 save(wave.data, file)  # last: this file shows that the wave is complete
+                return wave
             try:
                 data = load(file)
             except UserError as bad:

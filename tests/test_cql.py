@@ -95,7 +95,7 @@ def test_every_step_is_drawn_alike_and_followed_by_the_next(arriving):
     inner = t + 1 < arriving.length[i]
     np.testing.assert_array_equal(batch.after.proprio[inner], np.stack([i, t + 1], -1)[inner])
     after = arriving.position[i, np.minimum(t + 1, 6)]
-    np.testing.assert_array_equal(batch.after.goal[inner], (arriving.goal_world[i] - after)[inner])
+    np.testing.assert_array_equal(batch.after.goal_relative[inner], (arriving.goal_world[i] - after)[inner])
 
 
 def test_only_an_arrival_is_an_end(arriving):

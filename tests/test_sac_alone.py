@@ -63,7 +63,7 @@ def test_maps_are_recomputed_as_they_were(fresh):
     shown = jax.vmap(lambda at, to: local_map(UMAZE, at, to, cell_m=0.7))(info["position"], info["goal"])
     np.testing.assert_array_equal(inputs.map[:, 0], shown[:, 0])
     assert (inputs.map[:, 1] != shown[:, 1]).mean() < 0.01  # a goal between two cells may fall into either
-    np.testing.assert_array_equal(inputs.goal, fresh.env.obs["goal"])
+    np.testing.assert_array_equal(inputs.goal_relative, fresh.env.obs["goal"])
     np.testing.assert_array_equal(inputs.proprio, fresh.env.obs["proprio"])
     assert 0 < np.mean(inputs.map[:, 0]) < 1
 

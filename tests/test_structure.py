@@ -189,7 +189,7 @@ def test_wrong_import_is_found(text, module, found):
         ("from ct_envs import turtlebot3_pool", ["ct_envs.turtlebot3_pool"]),
         ("import ct_envs", ["ct_envs"]),
         ("from ct_jax.worlds.mazes import run", ["ct_jax.worlds.mazes.run"]),
-        ("from ct_envs.turtlebot3_pool import Frame\nfrom ct_envs.turtlebot3 import RADIUS_M\nimport mujoco", []),
+        ("from ct_envs.turtlebot3_pool import PoolFrame\nfrom ct_envs.turtlebot3 import RADIUS_M\nimport mujoco", []),
         ("from ct_envs.maze import Maze\nfrom ct_jax.worlds import kind_of", []),
     ],
 )  # fmt: skip

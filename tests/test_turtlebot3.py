@@ -29,8 +29,7 @@ from ct_envs.occupancy import LIDAR_BEAMS, LIDAR_CELL_M, lidar_map
 from ct_envs.robots import ROBOTS
 from ct_envs.turtlebot3 import MAX_NOISE, RADIUS_M, Turtlebot3Config, Turtlebot3Env, load_pybullet
 from ct_envs.turtlebot3_noise import Belief, Noise
-from ct_envs.turtlebot3_pool import _EMPTY, Episode, Turtlebot3Pool
-from ct_envs.turtlebot3_pool import Frame as PoolFrame
+from ct_envs.turtlebot3_pool import _EMPTY, Episode, PoolFrame, Turtlebot3Pool
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, load_world, make_world, random_world, save_world
 from ct_jax.collect import CollectConfig, collect
 from ct_jax.controllers.differential_drive import DifferentialDrive

@@ -27,13 +27,14 @@ from ct_envs import Robot, UserError
 from ct_envs.checked import Above, Checked, Count, Share, Within
 from ct_envs.frames import FrameName, symmetries
 from ct_envs.maze import Maze
-from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, blank_policy, sample_seen, tanh_gaussian
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, blank_policy, sample_observation, tanh_gaussian
 from ct_jax.learner import Info
 from ct_jax.learner import learn as learn_in_chunks
 from ct_jax.runtime.checkpoint import Checkpoints
 from ct_jax.runtime.devices import data_mesh, place, replicated, sharded
 from ct_jax.settings import Settings
 from ct_jax.trajectories import Trajectories, Window, at_goal, sample_windows
+from ct_jax.types import Observation
 
 NAME = "pt-cql"
 TRAJECTORIES = True
@@ -107,10 +108,10 @@ class Learned:
 class Transitions:
     """Single steps of trajectories, with the observations before and after."""
 
-    now: Seen
+    now: Observation
     action: Float[Array, "B A"]
     reward: Float[Array, "B"]  # [m]
-    after: Seen
+    after: Observation
     arrived: Float[Array, "B"]  # 1 if the step reached the goal, where the episode ends
     known: Float[Array, "B"]  # 0 if the trajectory was cut off here, so the next observation is unknown
 
@@ -120,7 +121,7 @@ def transitions(window: Window, goal_tolerance_m: float) -> Transitions:
 
     The reward of the last step shows whether it arrived or was cut off.
     """
-    see = lambda i: Seen(window.map[:, i], window.proprio[:, i], window.goal_relative[:, i])  # noqa: E731
+    see = lambda i: Observation(window.map[:, i], window.proprio[:, i], window.goal_relative[:, i])  # noqa: E731
     reward, last = window.reward[:, 0], 1.0 - window.valid[:, 1]
     arrived = last * at_goal(reward, goal_tolerance_m)
     known = window.valid[:, 0] * (1.0 - last + arrived)
@@ -144,7 +145,7 @@ class Cql:
     def create(self, key: jax.Array, data: Trajectories) -> "Cql":
         """The learner before training on data of these sizes, replicated over the devices."""
         actor_key, critic_key, key = jax.random.split(key, 3)
-        see = sample_seen(data.proprio.shape[-1])
+        see = sample_observation(data.proprio.shape[-1])
         actor = jax.jit(self.actor.init)(actor_key, see)
         critics = jax.jit(self.critics.init)(critic_key, see, jnp.zeros((1, 1, self.action_size)))
         params = Learned(actor, critics, jnp.log(jnp.asarray(self.config.temperature, jnp.float32)))

@@ -1,34 +1,28 @@
 """Actor and critics of the baselines. They have the transformer's inputs and map encoder, but no memory."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from brax.training.distribution import NormalTanhDistribution
 from flax import struct
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 from ct_envs.frames import FrameName
 from ct_envs.occupancy import MAP_CELLS
 from ct_envs.robots import Robot
 from ct_jax.controllers.augment import check_frame
 from ct_jax.transformer import GOAL_SCALE_M, MapEncoder, ModelConfig, body_features, directions, goal_features
-from ct_jax.types import Action, Frame, act_as_intended
+from ct_jax.types import Action, Frame, Observation, act_as_intended
 from ct_jax.worlds import kind_of
 
 
-class Seen(NamedTuple):
-    """One observation."""
-
-    map: UInt8[Array, "*b 2 k k"]
-    proprio: Float[Array, "*b P"]
-    goal: Float[Array, "*b 2"]  # from the robot [m]
-
-
-def sample_seen(proprio_size: int) -> Seen:
+def sample_observation(proprio_size: int) -> Observation:
     """An observation of zeros, to initialise parameters."""
-    return Seen(jnp.zeros((1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8), jnp.zeros((1, proprio_size)), jnp.zeros((1, 2)))
+    return Observation(
+        jnp.zeros((1, 2, MAP_CELLS, MAP_CELLS), jnp.uint8), jnp.zeros((1, proprio_size)), jnp.zeros((1, 2))
+    )
 
 
 def tanh_gaussian(action_size: int) -> NormalTanhDistribution:
@@ -36,13 +30,13 @@ def tanh_gaussian(action_size: int) -> NormalTanhDistribution:
     return NormalTanhDistribution(action_size)
 
 
-def _perceive(seen: Seen, width: int, frame: str) -> Float[Array, "*b F"]:
+def _perceive(seen: Observation, width: int, frame: str) -> Float[Array, "*b F"]:
     """The first hidden layer over an observation. Call it inside a module.
 
     With ``frame="heading"``, directions in the world are turned into the robot's own frame, as in the transformer.
     """
-    distance = jnp.linalg.norm(seen.goal, axis=-1, keepdims=True) / GOAL_SCALE_M
-    place = [MapEncoder(width)(seen.map), goal_features(seen.goal), distance]
+    distance = jnp.linalg.norm(seen.goal_relative, axis=-1, keepdims=True) / GOAL_SCALE_M
+    place = [MapEncoder(width)(seen.map), goal_features(seen.goal_relative), distance]
     if frame == "world":
         return nn.relu(nn.Dense(width)(jnp.concatenate([*place, seen.proprio], -1)))
     heading, body = body_features(seen.proprio)
@@ -58,7 +52,7 @@ class Actor(nn.Module):
     frame: str = "world"
 
     @nn.compact
-    def __call__(self, seen: Seen) -> Float[Array, "*b 2A"]:
+    def __call__(self, seen: Observation) -> Float[Array, "*b 2A"]:
         x = _perceive(seen, self.width, self.frame)
         for _ in range(2):
             x = nn.relu(nn.Dense(self.width)(x))
@@ -73,7 +67,7 @@ class Critics(nn.Module):
     norm: bool = False  # layer norm after the hidden layers
 
     @nn.compact
-    def __call__(self, seen: Seen, action: Float[Array, "*b M A"]) -> Float[Array, "*b M 2"]:
+    def __call__(self, seen: Observation, action: Float[Array, "*b M A"]) -> Float[Array, "*b M 2"]:
         x = _perceive(seen, self.width, self.frame)[..., None, :]
         values = []
         for _ in range(2):
@@ -103,11 +97,11 @@ class ActorPolicy:
     def act(self, memory: tuple[()], frame: Frame, key: jax.Array) -> tuple[Action, tuple[()]]:
         """The next actions in N environments with maps, and the empty memory."""
         del key
-        return act_as_intended(_best(self, Seen(frame.obs.map, frame.obs.proprio, frame.obs.goal_relative))), memory
+        return act_as_intended(_best(self, frame.obs)), memory
 
 
 @jax.jit  # some worlds step in NumPy
-def _best(policy: ActorPolicy, seen: Seen) -> Float[Array, "N A"]:
+def _best(policy: ActorPolicy, seen: Observation) -> Float[Array, "N A"]:
     logits: Any = Actor(policy.action_size, policy.width, policy.frame).apply(policy.params, seen)
     return tanh_gaussian(policy.action_size).mode(logits)
 
@@ -116,5 +110,5 @@ def blank_policy(robot: Robot, width: int, frame: FrameName) -> ActorPolicy:
     """A policy with the shapes of its parameters. Raises UserError for a frame that the robot does not have."""
     check_frame(frame, robot)
     proprio_size, action_size = kind_of(robot).sizes(robot)
-    params = jax.eval_shape(Actor(action_size, width, frame).init, jax.random.key(0), sample_seen(proprio_size))
+    params = jax.eval_shape(Actor(action_size, width, frame).init, jax.random.key(0), sample_observation(proprio_size))
     return ActorPolicy(params, action_size, width, frame)

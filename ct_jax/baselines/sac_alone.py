@@ -23,7 +23,7 @@ from ct_envs.frames import FrameName
 from ct_envs.maze import Maze
 from ct_envs.occupancy import local_map
 from ct_envs.robots import Robot
-from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, Seen, blank_policy, sample_seen, tanh_gaussian
+from ct_jax.baselines.networks import Actor, ActorPolicy, Critics, blank_policy, sample_observation, tanh_gaussian
 from ct_jax.controllers.augment import check_frame
 from ct_jax.controllers.off_policy import OffPolicy
 from ct_jax.controllers.reward import Reward, RewardConfig
@@ -32,6 +32,7 @@ from ct_jax.rollout import Environment
 from ct_jax.runtime.checkpoint import Checkpoints, run_to
 from ct_jax.settings import Settings
 from ct_jax.trajectories import Trajectories
+from ct_jax.types import Observation
 from ct_jax.worlds import kind_of
 
 NAME = "sac"
@@ -86,11 +87,11 @@ def _make_networks(
 ) -> sac_networks.SACNetworks:
     actor, critics = Actor(action_size, width, frame), Critics(width, frame, critic_norm)
     policy = FeedForwardNetwork(
-        init=lambda key: actor.init(key, sample_seen(proprio_size)),
+        init=lambda key: actor.init(key, sample_observation(proprio_size)),
         apply=lambda normalizer, params, seen: actor.apply(params, seen),
     )
     critic = FeedForwardNetwork(
-        init=lambda key: critics.init(key, sample_seen(proprio_size), jnp.zeros((1, 1, action_size))),
+        init=lambda key: critics.init(key, sample_observation(proprio_size), jnp.zeros((1, 1, action_size))),
         apply=lambda normalizer, params, seen, action: critics.apply(params, seen, action[:, None])[:, 0],  # pyright: ignore
     )
     return sac_networks.SACNetworks(policy, critic, tanh_gaussian(action_size))  # pyright: ignore[reportCallIssue]
@@ -132,11 +133,11 @@ class MazeTask:
         """Proprioception, the vector to the goal, and the position."""
         return jnp.concatenate([state.obs["proprio"], state.obs["goal"], state.info["position"]], -1)  # pyright: ignore
 
-    def inputs(self, observation: Float[Array, "N P+4"], maze: Maze) -> Seen:
+    def inputs(self, observation: Float[Array, "N P+4"], maze: Maze) -> Observation:
         """The same with the local map for the position."""
         proprio, goal, position = observation[:, :-4], observation[:, -4:-2], observation[:, -2:]
         see = jax.vmap(lambda at, to: local_map(maze, at, to, cell_m=self.env.map_cell_m))
-        return Seen(see(position, position + goal), proprio, goal)
+        return Observation(see(position, position + goal), proprio, goal)
 
     def ease(self, state: State, share: Float[Array, ""]) -> State:
         """The state as it is: starts are as hard from the first."""

@@ -19,27 +19,22 @@ if TYPE_CHECKING:
 _SHARED = "base"  # a file that is no robot's
 
 
-def find_robot(name: str, simulator: str | None = None) -> Robot:
+def find_robot(name: str) -> Robot:
     """The robot of that name, be it one that its file here registers. Raises UserError with the valid names."""
     if name not in ROBOTS and name in _files():  # its file may register it
         importlib.import_module(f"{__name__}.{name}")
-    return get_robot(name, simulator)
+    return get_robot(name)
 
 
 def get_preset(name: str, robot: str = "point") -> "Settings":
     """The preset of that name for a robot. Raises UserError with the valid names."""
-    known = _all_presets()
-    robot = get_robot(robot).name
-    if robot not in known:
+    robot = find_robot(robot).name
+    if robot not in _files():
         raise UserError(f"no presets for robot '{robot}'; add a file {robot}.py to ct_jax/configs")
-    if name not in known[robot]:
-        raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(known[robot]))}")
-    return known[robot][name]
-
-
-def _all_presets() -> dict[str, dict[str, "Settings"]]:
-    """The presets of each robot with a file in this folder."""
-    return {name: importlib.import_module(f"{__name__}.{name}").PRESETS for name in _files()}
+    presets = importlib.import_module(f"{__name__}.{robot}").PRESETS
+    if name not in presets:
+        raise UserError(f"no preset named '{name}'; presets: {', '.join(sorted(presets))}")
+    return presets[name]
 
 
 def _files() -> list[str]:

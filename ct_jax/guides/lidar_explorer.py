@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ct_envs.lidar import LIDAR_BEAMS, LIDAR_CELL_M, LIDAR_RANGE_M
 from ct_envs.turtlebot3 import to_heading
-from ct_envs.turtlebot3_pool import Frame as PoolFrame
+from ct_envs.turtlebot3_pool import PoolFrame
 from ct_jax.types import Frame
 
 _NEAR = 0.15  # first share of a straight path that is not checked: the robot may already be too close to an obstacle

@@ -15,8 +15,7 @@ import numpy as np
 from ct_envs import UserError
 from ct_envs.robots import TURTLEBOT3, Robot
 from ct_envs.turtlebot3 import RADIUS_M, Turtlebot3Config
-from ct_envs.turtlebot3_pool import Episode, Turtlebot3Pool
-from ct_envs.turtlebot3_pool import Frame as PoolFrame
+from ct_envs.turtlebot3_pool import Episode, PoolFrame, Turtlebot3Pool
 from ct_envs.turtlebot3_world import TRAIN_DENSITY, World, random_world
 from ct_jax.collect import CollectConfig
 from ct_jax.guides.lidar_explorer import LidarExplorer

@@ -41,7 +41,7 @@ class Episode:
     yaw_rad: float | None = None  # if None, it is drawn with the seed
 
 
-class Frame(NamedTuple):
+class PoolFrame(NamedTuple):
     """The observation and the state after a step; in a batch with a leading axis N."""
 
     map: np.ndarray  # uint8 [2, 25, 25]
@@ -61,7 +61,7 @@ class Frame(NamedTuple):
     grazing: np.ndarray
 
 
-_EMPTY = Frame(
+_EMPTY = PoolFrame(
     np.zeros((2, MAP_CELLS, MAP_CELLS), np.uint8), np.zeros(2, np.float32), np.zeros(2, np.float32), np.zeros(2),
     np.zeros(()), np.zeros(2), np.zeros(()), np.zeros(LIDAR_BEAMS, np.float32), np.zeros((), np.float32),
     np.zeros((), np.float32), np.ones((), bool), *[np.zeros((), bool)] * 4,
@@ -113,7 +113,7 @@ class Turtlebot3Pool:
             worker.end()
         self._workers = []
 
-    def reset(self, episodes: Sequence[Episode], slots: Sequence[int] | None = None) -> Frame:
+    def reset(self, episodes: Sequence[Episode], slots: Sequence[int] | None = None) -> PoolFrame:
         """Start episodes, by default in the first slots; returns the frames of all N slots. An unused slot is done.
 
         Raises:
@@ -130,7 +130,7 @@ class Turtlebot3Pool:
         self._logs |= {slot: (episode, []) for slot, episode in given.items()}
         return self._keep(frames)
 
-    def step(self, actions: np.ndarray) -> Frame:
+    def step(self, actions: np.ndarray) -> PoolFrame:
         """One control step of all N episodes with actions [N, 2]. Finished episodes do not change.
 
         Raises:
@@ -147,12 +147,12 @@ class Turtlebot3Pool:
             self._logs[slot][1].append(actions[slot])
         return self._keep(frames)
 
-    def _keep(self, frames: dict[int, Frame]) -> Frame:
+    def _keep(self, frames: dict[int, PoolFrame]) -> PoolFrame:
         for slot, frame in frames.items():
             self._frames[slot] = frame
-        return Frame(*(np.stack(leaves) for leaves in zip(*self._frames, strict=True)))
+        return PoolFrame(*(np.stack(leaves) for leaves in zip(*self._frames, strict=True)))
 
-    def _ask(self, command: str, content: dict[int, Any]) -> dict[int, Frame]:
+    def _ask(self, command: str, content: dict[int, Any]) -> dict[int, PoolFrame]:
         """Send a command to the workers of the given slots; returns the frames of these slots."""
         if not self._workers:
             raise UserError("the Turtlebot3 pool is closed; make a new one")
@@ -252,7 +252,9 @@ def _work(connection: Connection, config: Turtlebot3Config) -> None:
             return
 
 
-def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: dict[int, Episode]) -> dict[int, Frame]:
+def _reset(
+    envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: dict[int, Episode]
+) -> dict[int, PoolFrame]:
     frames = {}
     for slot, episode in episodes.items():
         if slot not in envs:
@@ -264,13 +266,13 @@ def _reset(envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, episodes: d
     return frames
 
 
-def _step(envs: dict[int, Turtlebot3Env], _: Turtlebot3Config, actions: dict[int, np.ndarray]) -> dict[int, Frame]:
+def _step(envs: dict[int, Turtlebot3Env], _: Turtlebot3Config, actions: dict[int, np.ndarray]) -> dict[int, PoolFrame]:
     return {slot: _frame(*envs[slot].step(action)) for slot, action in actions.items()}
 
 
 def _replay(
     envs: dict[int, Turtlebot3Env], config: Turtlebot3Config, logs: dict[int, tuple[Episode, list[np.ndarray]]]
-) -> dict[int, Frame]:
+) -> dict[int, PoolFrame]:
     _reset(envs, config, {slot: episode for slot, (episode, _) in logs.items()})
     for slot, (_, actions) in logs.items():
         for action in actions:
@@ -281,9 +283,9 @@ def _replay(
 _COMMANDS = {"reset": _reset, "step": _step, "replay": _replay}
 
 
-def _frame(obs: dict[str, np.ndarray], reward: float, done: bool, info: dict[str, Any]) -> Frame:
+def _frame(obs: dict[str, np.ndarray], reward: float, done: bool, info: dict[str, Any]) -> PoolFrame:
     flags = [np.asarray(info.get(name, False)) for name in ("success", "collision", "frontal", "grazing")]
-    return Frame(
+    return PoolFrame(
         obs["map"], obs["proprio"], obs["goal"], info["position"], np.asarray(info["yaw_rad"]),
         info["believed"].position, np.asarray(info["believed"].yaw_rad),
         info["ranges"].astype(np.float32), np.float32(reward), np.float32(info.get("believed_reward", 0.0)),
