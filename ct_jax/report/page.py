@@ -54,7 +54,7 @@ _GLOSSARY = {
 CURVES = {  # the curves of a stage: the scalar, its description, and the options of ``draw_curve``
     "controller": (
         ("success", "success on edges", {"rate": True}),
-        ("held_out", "success on held-out edges, without exploration noise", {"rate": True}),
+        ("held_out", "success on held-out edges, no noise", {"rate": True}),
         ("reward", "reward", {}),
     ),
     "value": (("loss", "loss", {"log": True}),),
